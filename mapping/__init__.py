@@ -1,0 +1,1 @@
+"""From scans and poses to occupancy grids."""

@@ -1,0 +1,49 @@
+"""The paper's deterministic mapper (III-A): Bresenham's lines, the last scan wins."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from mapping.grid import UNKNOWN, Layer, OccupancyGrid
+from mapping.rays import FREE, OCCUPIED, UNSEEN, end_extent, mark
+from prim.frames import Pose2D, Scan
+from prim.world import Bounds
+
+_PROBABILITY = np.array([0.0, 1.0, UNKNOWN], dtype=np.float32)
+assert (FREE, OCCUPIED, UNSEEN) == (0, 1, 2)
+
+
+class DeterministicMapper:
+    """Marks the cells that rays cross as free and the cells where they end as occupied.
+
+    Cells start unknown. Per scan all rays free their cells first and then all end points become occupied. A ray
+    without a return frees its cells and marks none. Without ``bounds`` the grid grows with the end points; rays
+    without a return are then followed within the bounds known so far.
+    """
+
+    name = "det"
+
+    def __init__(self, resolution: float = 0.01, bounds: Bounds | None = None) -> None:
+        self.resolution = resolution
+        self._layer = Layer(resolution, bounds, UNSEEN, np.uint8)
+
+    def update(self, scan: Scan, pose: Pose2D) -> None:
+        """Adds one scan, taken by a laser at ``pose`` in the map frame."""
+        place = (pose.x, pose.y, math.cos(pose.theta), math.sin(pose.theta))
+        limits = (scan.range_min, scan.range_max)
+        rays = (scan.ranges, scan.directions, place, limits, 1 / self.resolution)
+        layer = self._layer
+        if not layer.fixed:
+            layer.cover(*end_extent(*rays))
+        mark(layer.array, layer.frame.row, layer.frame.col, *rays)
+
+    def grid(self) -> OccupancyGrid:
+        """The map so far: 0 free, 1 occupied, 0.5 unknown."""
+        frame, states = self._layer.crop()
+        return OccupancyGrid(frame, _PROBABILITY[states])
+
+    def finish(self) -> OccupancyGrid:
+        """The map of all scans."""
+        return self.grid()

@@ -1,0 +1,421 @@
+"""Opening, reading and writing MCAP logs. All that can be wrong with a file becomes one LogReadError."""
+
+from __future__ import annotations
+
+import errno
+import os
+import struct
+import zlib
+from collections import Counter
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from types import TracebackType
+from typing import IO, NamedTuple, TypeVar
+
+from mcap.exceptions import EndOfFile, InvalidMagic, McapError, RecordLengthLimitExceeded
+from mcap.opcode import Opcode
+from mcap.reader import SeekingReader
+from mcap.records import Attachment, Channel, Chunk, McapRecord, Metadata, Schema
+from mcap.records import Message as McapMessage
+from mcap.stream_reader import CRCValidationError, StreamReader, breakup_chunk
+from mcap.summary import Summary
+from mcap.writer import CompressionType, Writer
+
+from prim.errors import LogReadError, OutputError
+from prim.messages import message_definition
+
+MAGIC = b"\x89MCAP0\r\n"
+CHUNK_BYTES = 256 * 1024
+FOOTER_BYTES = 1 + 8 + 8 + 8 + 4 + len(MAGIC)
+RECORD_LIMIT = 1 << 30
+"""No record of a readable log is larger (bytes); a length beyond it is damage."""
+
+_OTHER_FORMATS = (
+    (b"#ROSBAG", "a ROS 1 bag", "convert it with: rosbags-convert --dst-storage mcap"),
+    (b"SQLite format 3", "a ROS 2 bag in SQLite", "convert it with: rosbags-convert --dst-storage mcap"),
+    (b"\x89PNG", "a PNG image", "give an .mcap log"),
+    (b"RRF2", "a rerun recording", "open it with: rerun FILE"),
+)
+_SALVAGE = "read what is left of it with --recover"
+
+Decoded = TypeVar("Decoded")
+
+
+class Topic(NamedTuple):
+    """One topic of a log: its name, message type, encoding and how many messages it has."""
+
+    name: str
+    type: str
+    encoding: str
+    count: int
+
+
+class Message(NamedTuple):
+    """One message as it lies in the log: its topic, log time (ns) and bytes."""
+
+    topic: str
+    log_time: int
+    data: bytes
+
+
+@dataclass
+class _Contents:
+    """What a log holds besides its messages, as its summary or a pass over it tells."""
+
+    channels: dict[int, Channel] = field(default_factory=dict)
+    schemas: dict[int, Schema] = field(default_factory=dict)
+    counts: Counter[int] = field(default_factory=Counter)
+    metadata: dict[str, Mapping[str, str]] = field(default_factory=dict)
+
+
+class LogReader:
+    """A log that is open for reading, message by message, in bounded memory.
+
+    An intact log is read by its index, in the order of log times. With ``recover`` a damaged one is read chunk
+    by chunk in file order, and what could not be read is told by :attr:`lost`. Raises LogReadError.
+    """
+
+    def __init__(self, path: Path, recover: bool = False) -> None:
+        self.path = resolve_log(path)
+        self.recover = recover
+        self.lost: list[str] = []
+        self._file: IO[bytes] = _open(self.path)
+        self._index = SeekingReader(self._file, validate_crcs=True, record_size_limit=RECORD_LIMIT)
+        try:
+            self._summary = None if recover else self._read_summary()
+            self._contents = self._read_contents()
+        except BaseException:
+            self._file.close()
+            raise
+
+    def __enter__(self) -> LogReader:
+        return self
+
+    def __exit__(self, *exception: object) -> None:
+        self._file.close()
+
+    @property
+    def topics(self) -> dict[str, Topic]:
+        """The log's topics by name."""
+        topics: dict[str, Topic] = {}
+        for channel in self._contents.channels.values():
+            schema = self._contents.schemas.get(channel.schema_id)
+            count = self._contents.counts[channel.id]
+            if channel.topic in topics:
+                count += topics[channel.topic].count
+            name = schema.name if schema else ""
+            topics[channel.topic] = Topic(channel.topic, _ros2_name(name), channel.message_encoding, count)
+        return topics
+
+    @property
+    def metadata(self) -> Mapping[str, Mapping[str, str]]:
+        """The log's metadata records by name."""
+        return self._contents.metadata
+
+    def attachment(self, name: str) -> bytes | None:
+        """An attachment's bytes, None where the log has none of that name. Raises LogReadError."""
+        with _explained(self.path):
+            if self._summary is None:
+                records = self._linear_records([])
+                found = (r for r in records if isinstance(r, Attachment) and r.name == name)
+                return next((record.data for record in found), None)
+            for place in self._summary.attachment_indexes:
+                if place.name == name:
+                    return _record_at(self._file, place.offset, Attachment).data
+        return None
+
+    @property
+    def messages_lost(self) -> int | None:
+        """How many messages of a damaged log could not be read; None where nothing says how many there were."""
+        if not self.lost:
+            return 0
+        try:
+            summary = self._read_summary()
+        except LogReadError:
+            return None
+        if summary is None or summary.statistics is None:
+            return None
+        return summary.statistics.message_count - self._contents.counts.total()
+
+    def of_type(self, *types: str) -> list[Topic]:
+        """The topics that carry messages of any of these types and are not empty, by name."""
+        fitting = (topic for topic in self.topics.values() if topic.type in types and topic.count)
+        return sorted(fitting, key=lambda topic: topic.name)
+
+    def messages(self, *topics: str) -> Iterator[Message]:
+        """The messages of these topics. Raises LogReadError where the log is damaged or short of messages."""
+        if self.recover or self._summary is None or not self._summary.chunk_indexes:
+            yield from self._linear_messages(topics)
+            return
+        delivered: Counter[str] = Counter()
+        with _explained(self.path):
+            for _, channel, message in self._index.iter_messages(topics):
+                delivered[channel.topic] += 1
+                yield Message(channel.topic, message.log_time, message.data)
+        for name in topics:
+            if name in self.topics and delivered[name] != self.topics[name].count:
+                what = f"{name} has {delivered[name]} messages where the summary counts {self.topics[name].count}"
+                raise LogReadError(self.path, f"damaged: {what}", _SALVAGE)
+
+    def decoded(
+        self, topic: Topic, decode: Callable[[bytes], Decoded]
+    ) -> Iterator[tuple[int, Decoded]]:
+        """Log time (ns) and decoded message of one topic. Raises LogReadError on messages that do not decode."""
+        if topic.encoding != "cdr":
+            raise LogReadError(
+                self.path,
+                f"{topic.name} is encoded as {topic.encoding!r}, and only 'cdr' (ROS 2) can be read",
+                "convert the log with: rosbags-convert --dst-storage mcap",
+            )
+        for index, message in enumerate(self.messages(topic.name)):
+            try:
+                decoded = decode(message.data)
+            except ValueError as error:
+                where = f"message {index} of {topic.name}"
+                raise LogReadError(self.path, f"{where} cannot be decoded: {error}", _SALVAGE) from None
+            yield message.log_time, decoded
+
+    def _read_summary(self) -> Summary | None:
+        """The log's summary, its CRC checked; None where a complete log has none. Raises LogReadError."""
+        size = self._file.seek(0, os.SEEK_END)
+        self._file.seek(max(size - FOOTER_BYTES, 0))
+        end = self._file.read()
+        if len(end) < FOOTER_BYTES or not end.endswith(MAGIC) or end[0] != Opcode.FOOTER:
+            raise LogReadError(self.path, f"truncated: its end is missing ({size} bytes)", _SALVAGE)
+        start, _, crc = struct.unpack_from("<QQI", end, 9)
+        if start == 0:
+            return None
+        if start > size - FOOTER_BYTES:
+            raise LogReadError(self.path, "damaged: its summary lies beyond its end", _SALVAGE)
+        self._file.seek(start)
+        summary = self._file.read(size - FOOTER_BYTES - start) + end[:25]
+        if crc and zlib.crc32(summary) != crc:
+            raise LogReadError(self.path, "damaged: the CRC of its summary does not fit", _SALVAGE)
+        with _explained(self.path):
+            return self._index.get_summary()
+
+    def _read_contents(self) -> _Contents:
+        if self._summary is None or self._summary.statistics is None or not self._summary.channels:
+            return self._scan_contents()
+        with _explained(self.path):
+            contents = _Contents(self._summary.channels, self._summary.schemas)
+            contents.counts.update(self._summary.statistics.channel_message_counts)
+            for index in self._summary.metadata_indexes:
+                metadata = _record_at(self._file, index.offset, Metadata)
+                contents.metadata[metadata.name] = metadata.metadata
+        return contents
+
+    def _scan_contents(self) -> _Contents:
+        contents = _Contents()
+        for record in self._linear_records(self.lost):
+            if isinstance(record, Channel):
+                contents.channels[record.id] = record
+            elif isinstance(record, Schema):
+                contents.schemas[record.id] = record
+            elif isinstance(record, McapMessage):
+                contents.counts[record.channel_id] += 1
+            elif isinstance(record, Metadata):
+                contents.metadata[record.name] = record.metadata
+        return contents
+
+    def _linear_messages(self, topics: tuple[str, ...]) -> Iterator[Message]:
+        names = {number: channel.topic for number, channel in self._contents.channels.items()}
+        for record in self._linear_records([]):
+            if isinstance(record, McapMessage) and names.get(record.channel_id) in topics:
+                yield Message(names[record.channel_id], record.log_time, record.data)
+
+    def _linear_records(self, lost: list[str]) -> Iterator[McapRecord]:
+        """All records in file order; with ``recover`` damaged chunks are passed over and noted in ``lost``."""
+        self._file.seek(0)
+        stream = StreamReader(self._file, emit_chunks=True, record_size_limit=RECORD_LIMIT).records
+        while True:
+            try:
+                with _explained(self.path):
+                    record = next(stream, None)
+            except LogReadError as error:
+                if not self.recover:
+                    raise
+                lost.append(f"all beyond byte {self._file.tell()}: {error.what}")
+                return
+            if record is None:
+                return
+            if isinstance(record, Chunk):
+                yield from self._chunk_records(record, lost)
+            else:
+                yield record
+
+    def _chunk_records(self, chunk: Chunk, lost: list[str]) -> list[McapRecord]:
+        try:
+            with _explained(self.path):
+                return breakup_chunk(chunk, validate_crc=True)
+        except LogReadError as error:
+            if not self.recover:
+                raise
+            seconds = (chunk.message_end_time - chunk.message_start_time) / 1e9
+            lost.append(f"a chunk of {seconds:.2f} s before byte {self._file.tell()}: {error.what}")
+            return []
+
+
+def resolve_log(path: Path) -> Path:
+    """The log's file: ``path`` itself, or the one .mcap file in it if it is a folder (a ROS 2 bag).
+
+    Raises LogReadError.
+    """
+    if not path.is_dir():
+        return path
+    logs = sorted(path.glob("*.mcap"))
+    if len(logs) == 1:
+        return logs[0]
+    if logs:
+        names = ", ".join(log.name for log in logs)
+        raise LogReadError(path, f"a folder with {len(logs)} logs ({names})", "give one of them")
+    raise LogReadError(path, "a folder without an .mcap log in it", "give an .mcap file or a ROS 2 bag's folder")
+
+
+class LogWriter:
+    """Writes a ROS 2 MCAP log: chunked, zstd, CRCs on.
+
+    Until it is closed the log lies beside ``path`` with ``.part`` at its end, and what has been flushed of it
+    can be read with ``--recover``. Raises OutputError where the place cannot be written.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.part = path.with_name(path.name + ".part")
+        try:
+            if path.is_dir():
+                raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR))
+            self._file = self.part.open("wb")
+        except OSError as error:
+            raise OutputError(path, error) from error
+        self._writer = Writer(
+            self._file, chunk_size=CHUNK_BYTES, compression=CompressionType.ZSTD, enable_crcs=True
+        )
+        self._writer.start(profile="ros2", library="prim")
+        self._channels: dict[str, int] = {}
+
+    def __enter__(self) -> LogWriter:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        try:
+            self._writer.finish()
+            self._file.flush()
+            os.fsync(self._file.fileno())
+            self._file.close()
+            if error is None:
+                self.part.replace(self.path)
+        except OSError as failure:
+            raise OutputError(self.path, failure) from failure
+
+    def add_metadata(self, name: str, values: Mapping[str, str]) -> None:
+        """Adds a metadata record; call it before the first message."""
+        self._writer.add_metadata(name, dict(values))
+
+    def attach(self, name: str, media_type: str, data: bytes, stamp: int) -> None:
+        """Adds an attachment; call it before the first message."""
+        self._writer.add_attachment(stamp, stamp, name, media_type, data)
+
+    def add_topic(self, topic: str, type_name: str, latched: bool = False) -> None:
+        """Announces a topic; the messages of a ``latched`` one reach late subscribers when it is played back."""
+        schema = self._writer.register_schema(type_name, "ros2msg", message_definition(type_name).encode())
+        profile = _LATCHED_QOS if latched else "[]"
+        self._channels[topic] = self._writer.register_channel(
+            topic, "cdr", schema, {"offered_qos_profiles": profile}
+        )
+
+    def write(self, topic: str, stamp: int, data: bytes) -> None:
+        """Writes one CDR message, logged and published at ``stamp`` (ns)."""
+        try:
+            self._writer.add_message(self._channels[topic], stamp, data, stamp)
+        except OSError as error:
+            raise OutputError(self.path, error) from error
+
+    def flush(self) -> None:
+        """Hands all finished chunks to the operating system."""
+        self._file.flush()
+
+
+_LATCHED_QOS = """\
+- history: keep_last
+  depth: 1
+  reliability: reliable
+  durability: transient_local
+  deadline:
+    sec: 9223372036
+    nsec: 854775807
+  lifespan:
+    sec: 9223372036
+    nsec: 854775807
+  liveliness: automatic
+  liveliness_lease_duration:
+    sec: 9223372036
+    nsec: 854775807
+  avoid_ros_namespace_conventions: false
+"""
+
+
+def _ros2_name(name: str) -> str:
+    """ROS 1 and ROS 2 names of a type made one: package/Type becomes package/msg/Type."""
+    parts = name.split("/")
+    return f"{parts[0]}/msg/{parts[1]}" if len(parts) == 2 else name
+
+
+def _open(path: Path) -> IO[bytes]:
+    """Opens a file that begins like an MCAP log. Raises LogReadError."""
+    try:
+        stream = path.open("rb")
+    except OSError as error:
+        raise LogReadError(path, f"cannot open: {error.strerror}") from error
+    start = stream.read(16)
+    if start.startswith(MAGIC):
+        stream.seek(0)
+        return stream
+    stream.close()
+    if not start:
+        raise LogReadError(path, "an empty file (0 bytes)", "give an .mcap log")
+    for magic, what, hint in _OTHER_FORMATS:
+        if start.startswith(magic):
+            raise LogReadError(path, f"{what}, not an MCAP log", hint)
+    raise LogReadError(path, "not an MCAP log: it begins with other bytes", "give an .mcap log")
+
+
+Record = TypeVar("Record", Metadata, Attachment)
+
+
+def _record_at(stream: IO[bytes], offset: int, kind: type[Record]) -> Record:
+    stream.seek(offset)
+    records = StreamReader(stream, skip_magic=True, record_size_limit=RECORD_LIMIT).records
+    record = next(iter(records))
+    if not isinstance(record, kind):
+        raise McapError(f"no {kind.__name__} at byte {offset}")
+    return record
+
+
+@contextmanager
+def _explained(path: Path) -> Iterator[None]:
+    """Turns everything that mcap and its codecs raise on damaged files into a LogReadError."""
+    try:
+        yield
+    except LogReadError:
+        raise
+    except CRCValidationError as error:
+        raise LogReadError(path, f"damaged: the CRC of a {type(error.record).__name__} does not fit", _SALVAGE) from error
+    except (EndOfFile, RecordLengthLimitExceeded) as error:
+        raise LogReadError(path, "truncated or damaged: a record runs past the end", _SALVAGE) from error
+    except InvalidMagic as error:
+        raise LogReadError(path, "damaged: it does not end as an MCAP log does", _SALVAGE) from error
+    except McapError as error:
+        raise LogReadError(path, f"cannot be read: {error}") from error
+    except OSError as error:
+        raise LogReadError(path, f"cannot be read: {error.strerror or error}", _SALVAGE) from error
+    except Exception as error:  # struct.error, KeyError, ZstdError, UnicodeDecodeError, ...: the file is damaged
+        raise LogReadError(path, f"damaged: {error or type(error).__name__}", _SALVAGE) from error
+

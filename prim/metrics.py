@@ -1,0 +1,207 @@
+"""How good detections and maps are: one definition for replay, evaluation and benchmarks."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Sequence
+from dataclasses import asdict, dataclass
+
+import numpy as np
+import shapely
+from numpy.typing import NDArray
+
+from prim.shapes import FloatArray, Primitive, angle_error
+
+BoolGrid = NDArray[np.bool_]
+
+FOUND_IOU = 0.5
+"""A primitive counts as found when the kind agrees and the polygons' IoU is at least this."""
+
+TOLERANCE_CELLS = 1
+"""How far (cells, 8 neighbours) an occupied cell may lie from the truth's and still count."""
+
+
+@dataclass(frozen=True, slots=True)
+class Pair:
+    """A detection and the true primitive it overlaps most, by their indices, with the errors (m, rad)."""
+
+    detection: int
+    truth: int
+    same_kind: bool
+    position: float
+    angle: float | None
+    width: float
+    height: float
+    iou: float
+
+    @property
+    def found(self) -> bool:
+        """Whether the pair counts as a find."""
+        return self.same_kind and self.iou >= FOUND_IOU
+
+
+@dataclass(frozen=True, slots=True)
+class DetectionErrors:
+    """Finds over all detections and all true primitives; mean absolute errors (m, rad) over the finds.
+
+    A mean is None where nothing was found (the angle's: nothing with an angle).
+    """
+
+    precision: float
+    recall: float
+    f1: float
+    position: float | None
+    angle: float | None
+    width: float | None
+    height: float | None
+    iou: float | None
+    pairs: tuple[Pair, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class MapScores:
+    """How a map's cells agree with the truth's; a score is None where it has no cells to count."""
+
+    occupied_precision: float | None
+    occupied_recall: float | None
+    occupied_f1: float | None
+    free_accuracy: float | None
+    auc: float | None
+
+    def to_json(self) -> dict[str, float | None]:
+        """As the report holds them."""
+        return asdict(self)
+
+
+def polygon_iou(a: Primitive, b: Primitive) -> float:
+    """Intersection over union of two outlines' polygons."""
+    first, second = shapely.Polygon(a.outline()), shapely.Polygon(b.outline())
+    shared: float = first.intersection(second).area
+    return shared / (first.area + second.area - shared)
+
+
+def match_primitives(detections: Sequence[Primitive], truth: Sequence[Primitive]) -> list[Pair]:
+    """Pairs of overlapping detections and true primitives, each used once, best first.
+
+    Pairs of the same kind go before pairs of different kinds, larger IoU before smaller. True primitives do
+    not overlap, so that no detection overlaps two of them by half and this greedy order finds as many as any.
+    """
+    candidates = [
+        pair
+        for i, detection in enumerate(detections)
+        for j, true in enumerate(truth)
+        if (pair := _pair(i, j, detection, true)).iou > 0
+    ]
+    candidates.sort(key=lambda pair: (pair.found, pair.iou), reverse=True)
+    pairs: list[Pair] = []
+    for pair in candidates:
+        if all(pair.detection != other.detection and pair.truth != other.truth for other in pairs):
+            pairs.append(pair)
+    return pairs
+
+
+def detection_errors(detections: Sequence[Primitive], truth: Sequence[Primitive]) -> DetectionErrors:
+    """Precision, recall, F1 and mean errors of detections against the truth (the paper's Table II averages)."""
+    pairs = match_primitives(detections, truth)
+    found = [pair for pair in pairs if pair.found]
+    precision = len(found) / len(detections) if detections else float(not truth)
+    recall = len(found) / len(truth) if truth else float(not detections)
+    return DetectionErrors(
+        precision=precision,
+        recall=recall,
+        f1=_f1(precision, recall),
+        position=_mean(pair.position for pair in found),
+        angle=_mean(pair.angle for pair in found if pair.angle is not None),
+        width=_mean(pair.width for pair in found),
+        height=_mean(pair.height for pair in found),
+        iou=_mean(pair.iou for pair in found),
+        pairs=tuple(pairs),
+    )
+
+
+def map_scores(
+    probability: NDArray[np.floating],
+    occupied: BoolGrid,
+    free: BoolGrid,
+    tolerance: int = TOLERANCE_CELLS,
+) -> MapScores:
+    """Scores of a map against the cells that are truly ``occupied`` and truly ``free``, all (rows, cols).
+
+    The map calls a cell occupied where its probability is above 0.5 and free where it is below. Precision: of
+    the cells called occupied that are truly occupied (within ``tolerance`` cells, 8 neighbours) or truly free,
+    the share of the former; cells that no beam can reach do not count. Recall: the share of truly occupied
+    cells with one called occupied within the tolerance. Free accuracy: the share of truly free cells called
+    free. AUC: the chance that a truly occupied cell has a higher probability than a truly free one.
+    """
+    called = probability > 0.5
+    near_truth = dilate(occupied, tolerance)
+    right = np.count_nonzero(called & near_truth)
+    wrong = np.count_nonzero(called & free & ~near_truth)
+    precision = _share(right, right + wrong)
+    recall = _share(np.count_nonzero(occupied & dilate(called, tolerance)), np.count_nonzero(occupied))
+    return MapScores(
+        occupied_precision=precision,
+        occupied_recall=recall,
+        occupied_f1=None if recall is None else _f1(precision or 0.0, recall),
+        free_accuracy=_share(np.count_nonzero(free & (probability < 0.5)), np.count_nonzero(free)),
+        auc=_auc(probability[occupied], probability[free]),
+    )
+
+
+def dilate(cells: BoolGrid, steps: int) -> BoolGrid:
+    """The cells and all within ``steps`` cells of them (8 neighbours)."""
+    grown = cells.copy()
+    for axis in (0, 1):
+        line = grown.copy()
+        for step in range(1, steps + 1):
+            ahead, behind = [slice(None)] * 2, [slice(None)] * 2
+            ahead[axis], behind[axis] = slice(step, None), slice(None, -step)
+            grown[tuple(ahead)] |= line[tuple(behind)]
+            grown[tuple(behind)] |= line[tuple(ahead)]
+    return grown
+
+
+def pose_rmse(estimate: FloatArray, truth: FloatArray) -> tuple[float, float]:
+    """Root mean square errors of position (m) and heading (rad) of poses (N, 3), without any alignment."""
+    delta = estimate - truth
+    turn = (delta[:, 2] + np.pi) % (2 * np.pi) - np.pi
+    return float(np.sqrt((delta[:, :2] ** 2).sum(axis=1).mean())), float(np.sqrt((turn**2).mean()))
+
+
+def _pair(i: int, j: int, detection: Primitive, truth: Primitive) -> Pair:
+    width, height = detection.width_height
+    true_width, true_height = truth.width_height
+    same_kind = detection.kind is truth.kind
+    return Pair(
+        detection=i,
+        truth=j,
+        same_kind=same_kind,
+        position=math.hypot(detection.x - truth.x, detection.y - truth.y),
+        angle=angle_error(detection, truth) if same_kind else None,
+        width=abs(width - true_width),
+        height=abs(height - true_height),
+        iou=polygon_iou(detection, truth),
+    )
+
+
+def _auc(occupied: NDArray[np.floating], free: NDArray[np.floating]) -> float | None:
+    """Area under the ROC curve: the Mann-Whitney statistic, ties counted half."""
+    if not len(occupied) or not len(free):
+        return None
+    ranked = np.sort(free)
+    below = np.searchsorted(ranked, occupied, side="left").mean()
+    not_above = np.searchsorted(ranked, occupied, side="right").mean()
+    return float((below + not_above) / (2 * len(free)))
+
+
+def _f1(precision: float, recall: float) -> float:
+    return 2 * precision * recall / (precision + recall) if precision + recall else 0.0
+
+
+def _share(part: int, whole: int) -> float | None:
+    return part / whole if whole else None
+
+
+def _mean(values: Iterable[float]) -> float | None:
+    listed = list(values)
+    return sum(listed) / len(listed) if listed else None

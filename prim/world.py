@@ -1,0 +1,102 @@
+"""The exact truth of a recorded session: primitives and walls, and what a perfect beam would measure."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from prim.errors import WorldError
+from prim.shapes import FloatArray, Primitive
+
+Wall = tuple[float, float, float, float]
+"""A thin wall from (x0, y0) to (x1, y1), metres, map frame."""
+
+Bounds = tuple[float, float, float, float]
+"""x0, y0, x1, y1 in metres."""
+
+
+@dataclass(frozen=True)
+class World:
+    """Primitives and thin walls on a floor of ``size`` (m along x and y), centred on the map's origin."""
+
+    size: tuple[float, float]
+    primitives: tuple[Primitive, ...] = ()
+    walls: tuple[Wall, ...] = ()
+
+    @property
+    def bounds(self) -> Bounds:
+        """The floor's extent."""
+        width, height = self.size
+        return -width / 2, -height / 2, width / 2, height / 2
+
+    def walled(self) -> World:
+        """The same world with a wall along each edge of the floor."""
+        x0, y0, x1, y1 = self.bounds
+        return replace(self, walls=((x0, y0, x1, y0), (x1, y0, x1, y1), (x1, y1, x0, y1), (x0, y1, x0, y0)))
+
+    def cast(self, origin: tuple[float, float], directions: FloatArray) -> FloatArray:
+        """Exact distances (m) to the nearest surface along unit ``directions`` (N, 2); inf where there is none."""
+        distances = _cast_walls(origin, directions, self.walls)
+        for primitive in self.primitives:
+            np.minimum(distances, primitive.cast(origin, directions), out=distances)
+        return distances
+
+    def to_json(self) -> dict[str, Any]:
+        """As the log's attachment ``world.json`` holds it."""
+        return {
+            "size": list(self.size),
+            "walls": [list(wall) for wall in self.walls],
+            "primitives": [primitive.to_json() for primitive in self.primitives],
+        }
+
+    @classmethod
+    def from_json(cls, value: Mapping[str, Any]) -> World:
+        """The inverse of :meth:`to_json`. Raises ValueError that names what is wrong."""
+        if not isinstance(value, Mapping) or "size" not in value:
+            raise ValueError("a world is an object with 'size', 'primitives' and 'walls'")
+        size = _numbers(value["size"], 2, "size")
+        walls = tuple(_numbers(wall, 4, "a wall") for wall in value.get("walls", ()))
+        primitives = tuple(Primitive.from_json(item).canonical() for item in value.get("primitives", ()))
+        if min(size) <= 0:
+            raise ValueError(f"size {list(size)} is not positive")
+        return cls((size[0], size[1]), primitives, tuple((a, b, c, d) for a, b, c, d in walls))
+
+    @classmethod
+    def load(cls, path: Path) -> World:
+        """Reads a world from a JSON file. Raises WorldError."""
+        try:
+            return cls.from_json(json.loads(path.read_text(encoding="utf-8")))
+        except OSError as error:
+            raise WorldError(f"{path}: cannot read the world: {error.strerror}") from error
+        except (ValueError, TypeError, AttributeError) as error:
+            raise WorldError(f"{path}: not a world: {error}") from error
+
+
+def _numbers(value: Any, count: int, what: str) -> tuple[float, ...]:
+    if not isinstance(value, Sequence) or isinstance(value, str) or len(value) != count:
+        raise ValueError(f"{what} is {count} numbers, not {json.dumps(value)}")
+    numbers = tuple(float(number) for number in value)
+    if not all(math.isfinite(number) for number in numbers):
+        raise ValueError(f"{what} has a number that is not finite: {numbers}")
+    return numbers
+
+
+def _cast_walls(origin: tuple[float, float], directions: FloatArray, walls: Sequence[Wall]) -> FloatArray:
+    """Distances to the nearest of thin ``walls``; their ends belong to them, so that corners are closed."""
+    if not walls:
+        return np.full(len(directions), np.inf)
+    ends = np.asarray(walls, dtype=float)
+    along = ends[:, 2:] - ends[:, :2]
+    towards = ends[:, :2] - origin
+    cross = directions[:, :1] * along[:, 1] - directions[:, 1:] * along[:, 0]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        distance = (towards[:, 0] * along[:, 1] - towards[:, 1] * along[:, 0]) / cross
+        share = (towards[:, 0] * directions[:, 1:] - towards[:, 1] * directions[:, :1]) / cross
+    hits = (cross != 0) & (distance >= 0) & (share >= -1e-12) & (share <= 1 + 1e-12)
+    return np.where(hits, distance, np.inf).min(axis=1)

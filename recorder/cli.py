@@ -1,0 +1,156 @@
+"""prim-record: the command line of the recorder."""
+
+from __future__ import annotations
+
+import math
+import sys
+from collections import Counter
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from prim import __version__, console
+from prim.errors import UsageError
+
+if TYPE_CHECKING:
+    from prim.shapes import Kind
+    from recorder.session import Session, SessionOptions
+
+PAPER_NOISE_UNIT = 5.0
+"""``--noise 1`` is a standard deviation of this many metres (the paper's IV-A)."""
+
+KINDS = "square,rectangle,circle,triangle,ellipse"
+
+app = typer.Typer(add_completion=False, rich_markup_mode=None)
+
+
+def _show_version(wanted: bool) -> None:
+    if wanted:
+        typer.echo(f"prim-record {__version__}")
+        raise typer.Exit
+
+
+@app.command()
+def record(
+    output: Annotated[Path, typer.Argument(metavar="OUT.mcap", help="The log to write.")],
+    seed: Annotated[int, typer.Option(min=0, help="The same seed and options write the same bytes.")] = 0,
+    world: Annotated[Path | None, typer.Option(help="Read the world from this JSON file.")] = None,
+    size: Annotated[tuple[float, float], typer.Option(metavar="X Y", help="The floor, metres.")] = (2.0, 2.0),
+    walls: Annotated[bool, typer.Option(help="A wall along each edge of the floor.")] = True,
+    kinds: Annotated[str, typer.Option(help="Kinds of primitives to draw, with commas.")] = KINDS,
+    per_kind: Annotated[
+        str, typer.Option(metavar="N or A-B", help="How many of each kind: a number or a range.")
+    ] = "0-2",
+    stops: Annotated[
+        tuple[int, int], typer.Option(metavar="COLS ROWS", help="The grid of places the robot is warped to.")
+    ] = (10, 10),
+    rate: Annotated[float, typer.Option(help="Scans per second.")] = 10.0,
+    rays: Annotated[int, typer.Option(min=1, help="Beams in a scan.")] = 500,
+    fov: Annotated[float, typer.Option(help="Field of view, degrees.")] = round(math.degrees(6.28), 4),
+    range_min: Annotated[float, typer.Option(help="Shortest range, metres.")] = 0.032,
+    range_max: Annotated[float, typer.Option(help="Longest range, metres.")] = 5.0,
+    noise: Annotated[
+        float | None, typer.Option(help="LiDAR noise in the paper's unit: 0.05 is a std of 0.25 m.")
+    ] = None,
+    noise_std: Annotated[
+        float | None, typer.Option(help="LiDAR noise, std in metres. [default: 0.05]", show_default=False)
+    ] = None,
+    gps_noise: Annotated[float, typer.Option(help="GPS noise, std in metres.")] = 0.1,
+    compass_noise: Annotated[float, typer.Option(help="Compass noise, std in degrees.")] = 3.0,
+    quiet: Annotated[bool, typer.Option("--quiet", help="Print nothing.")] = False,
+    debug: Annotated[bool, typer.Option("--debug", help="Show tracebacks.")] = False,
+    version: Annotated[
+        bool, typer.Option("--version", callback=_show_version, is_eager=True, help="Print the version.")
+    ] = False,
+) -> int:
+    """Record a simulated session of a robot with a 2D LiDAR to an MCAP log."""
+    from recorder.sensors import Compass, Gps, Lidar
+    from recorder.session import SessionOptions
+    from recorder.session import record as record_session
+    from recorder.world import WorldOptions
+
+    _check_positive(
+        {"--size": min(size), "--rate": rate, "--fov": fov, "--range-max": range_max, "--stops": min(stops)}
+    )
+    _check_not_negative({"--range-min": range_min, "--gps-noise": gps_noise, "--compass-noise": compass_noise})
+    if range_min >= range_max:
+        raise UsageError(f"--range-min {range_min:g} is not below --range-max {range_max:g}")
+    if fov > 360:
+        raise UsageError(f"--fov {fov:g} is more than a full turn of 360 degrees")
+    options = SessionOptions(
+        seed=seed,
+        world=WorldOptions(size, _kinds(kinds), _per_kind(per_kind), walls),
+        world_file=world,
+        stops=stops,
+        rate=rate,
+        lidar=Lidar(rays, _fov_radians(fov), range_min, range_max, _noise_std(noise, noise_std)),
+        gps=Gps(gps_noise),
+        compass=Compass(math.radians(compass_noise)),
+    )
+    session = record_session(output, options)
+    if not quiet:
+        typer.echo(_summary(session, options))
+    return 0
+
+
+def _fov_radians(degrees: float) -> float:
+    """The default is the paper's 6.28 rad, which degrees only come close to."""
+    return 6.28 if degrees == round(math.degrees(6.28), 4) else math.radians(degrees)
+
+
+def _kinds(text: str) -> tuple[Kind, ...]:
+    from prim.shapes import Kind
+
+    names = [name.strip() for name in text.split(",") if name.strip()]
+    unknown = [name for name in names if name not in KINDS.split(",")]
+    if unknown or not names:
+        raise UsageError(f"--kinds {text!r}: {unknown or 'nothing'} named; there are {KINDS}")
+    return tuple(Kind(name) for name in names)
+
+
+def _per_kind(text: str) -> tuple[int, int]:
+    first, _, last = text.partition("-")
+    try:
+        fewest, most = int(first), int(last or first)
+    except ValueError:
+        raise UsageError(f"--per-kind {text!r} is neither a number nor a range such as 0-2") from None
+    if not 0 <= fewest <= most:
+        raise UsageError(f"--per-kind {text!r} is not a range from small to large")
+    return fewest, most
+
+
+def _noise_std(noise: float | None, noise_std: float | None) -> float:
+    if noise is not None and noise_std is not None:
+        raise UsageError("--noise and --noise-std say the same in two units: give one of them")
+    _check_not_negative({"--noise": noise or 0.0, "--noise-std": noise_std or 0.0})
+    if noise is not None:
+        return noise * PAPER_NOISE_UNIT
+    return 0.05 if noise_std is None else noise_std
+
+
+def _check_positive(values: dict[str, float]) -> None:
+    for name, value in values.items():
+        if not (value > 0 and math.isfinite(value)):
+            raise UsageError(f"{name} is {value:g}: it must be above 0")
+
+
+def _check_not_negative(values: dict[str, float]) -> None:
+    for name, value in values.items():
+        if not (value >= 0 and math.isfinite(value)):
+            raise UsageError(f"{name} is {value:g}: it must not be below 0")
+
+
+def _summary(session: Session, options: SessionOptions) -> str:
+    counts = Counter(str(primitive.kind) for primitive in session.world.primitives)
+    what = ", ".join(f"{count} {kind}{'s' * (count > 1)}" for kind, count in counts.items()) or "no primitives"
+    skipped = f" ({session.skipped} stops skipped, in a primitive's way)" if session.skipped else ""
+    return (
+        f"{session.path}: {session.scans} scans of {options.lidar.rays} rays{skipped}, "
+        f"noise {options.lidar.noise_std * 1000:g} mm, {what}\nreplay it: prim-replay {session.path}"
+    )
+
+
+def main() -> None:
+    """The entry point."""
+    sys.exit(console.run(app, "prim-record", sys.argv[1:]))

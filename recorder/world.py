@@ -1,0 +1,91 @@
+"""Random worlds as the paper draws them (III-B): mixed primitives on a floor of 2 x 2 m, no two overlapping."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import shapely
+
+from prim.errors import UsageError
+from prim.shapes import Kind, Primitive
+from prim.world import World
+
+GAP = 0.03
+"""Primitives keep this far (m) from each other and from the floor's edge."""
+
+_TRIES_PER_PRIMITIVE = 200
+_TRIES_PER_WORLD = 500
+_MIN_TRIANGLE_HEIGHT = 0.06
+
+
+@dataclass(frozen=True)
+class WorldOptions:
+    """What a random world holds: ``per_kind`` (fewest, most) primitives of each of ``kinds``, on ``size`` metres."""
+
+    size: tuple[float, float] = (2.0, 2.0)
+    kinds: tuple[Kind, ...] = tuple(Kind)
+    per_kind: tuple[int, int] = (0, 2)
+    walls: bool = True
+
+
+def draw_world(rng: np.random.Generator, options: WorldOptions) -> World:
+    """Draws a world. Raises UsageError where the primitives asked for do not fit on the floor."""
+    for _ in range(_TRIES_PER_WORLD):
+        fewest, most = options.per_kind
+        kinds = [kind for kind in options.kinds for _ in range(rng.integers(fewest, most, endpoint=True))]
+        primitives = _place(rng, kinds, options.size)
+        if primitives is not None:
+            world = World(options.size, tuple(primitives))
+            return world.walled() if options.walls else world
+    width, height = options.size
+    raise UsageError(
+        f"{options.per_kind[1]} of each of {len(options.kinds)} kinds do not fit on {width:g} x {height:g} m: "
+        "give a larger --size or a smaller --per-kind"
+    )
+
+
+def _place(
+    rng: np.random.Generator, kinds: Sequence[Kind], size: tuple[float, float]
+) -> list[Primitive] | None:
+    """Primitives of these kinds, apart from each other; None where one found no place."""
+    placed: list[Primitive] = []
+    outlines: list[shapely.Polygon] = []
+    floor = shapely.box(-size[0] / 2, -size[1] / 2, size[0] / 2, size[1] / 2).buffer(-GAP, join_style="mitre")
+    for kind in kinds:
+        for _ in range(_TRIES_PER_PRIMITIVE):
+            primitive = draw_primitive(rng, kind, size)
+            outline = shapely.Polygon(primitive.outline())
+            if floor.contains(outline) and all(outline.distance(other) >= GAP for other in outlines):
+                placed.append(primitive)
+                outlines.append(outline)
+                break
+        else:
+            return None
+    return placed
+
+
+def draw_primitive(rng: np.random.Generator, kind: Kind, size: tuple[float, float]) -> Primitive:
+    """One primitive of random size, heading and place (its size within the paper's ranges)."""
+    lengths = _DRAW_SIZE[kind](rng)
+    theta = None if kind is Kind.CIRCLE else rng.uniform(0, 2 * math.pi)
+    x, y = (rng.uniform(-length / 2, length / 2) for length in size)
+    return Primitive(kind, x, y, theta, lengths).canonical()
+
+
+def _draw_triangle(rng: np.random.Generator) -> tuple[float, float]:
+    while True:
+        base, leg = rng.uniform(0.1, 0.3), rng.uniform(0.1, 0.3)
+        if leg > base / 2 and (height := math.sqrt(leg**2 - base**2 / 4)) >= _MIN_TRIANGLE_HEIGHT:
+            return base, height
+
+
+_DRAW_SIZE: Mapping[Kind, Callable[[np.random.Generator], tuple[float, ...]]] = {
+    Kind.SQUARE: lambda rng: (rng.uniform(0.08, 0.3),),
+    Kind.RECTANGLE: lambda rng: (rng.uniform(0.06, 0.32), rng.uniform(0.06, 0.32)),
+    Kind.CIRCLE: lambda rng: (rng.uniform(0.05, 0.3),),
+    Kind.TRIANGLE: _draw_triangle,
+    Kind.ELLIPSE: lambda rng: (rng.uniform(0.02, 0.16), rng.uniform(0.02, 0.16)),
+}

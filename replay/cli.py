@@ -1,0 +1,279 @@
+"""prim-replay: the command line of the replay."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import sys
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from enum import StrEnum
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from prim import __version__, console
+from prim.errors import UsageError
+
+if TYPE_CHECKING:
+    from prim.world import Bounds
+    from replay.pipeline import Progress, ReplayOptions, ReplayResult
+    from replay.show import Viewer, ViewerOptions
+
+PARTLY_LOST = 3
+"""The exit code when part of a log could not be read."""
+
+app = typer.Typer(add_completion=False, rich_markup_mode=None)
+
+
+class MapperName(StrEnum):
+    """The mappers."""
+
+    DET = "det"
+    PROB = "prob"
+
+
+class PoseName(StrEnum):
+    """The sources of poses."""
+
+    AUTO = "auto"
+    TRUTH = "truth"
+    TF = "tf"
+    ODOM = "odom"
+
+
+def _show_version(wanted: bool) -> None:
+    if wanted:
+        typer.echo(f"prim-replay {__version__}")
+        raise typer.Exit
+
+
+@app.command()
+def replay(
+    logs: Annotated[list[Path], typer.Argument(metavar="LOG...", help="MCAP logs, or folders of ROS 2 bags.")],
+    mapper: Annotated[MapperName, typer.Option(help="How the map is made.")] = MapperName.PROB,
+    pose: Annotated[PoseName, typer.Option(help="Where poses come from.")] = PoseName.AUTO,
+    resolution: Annotated[float, typer.Option(metavar="M", help="Side of a cell, metres.")] = 0.01,
+    bounds: Annotated[
+        str, typer.Option(metavar="auto or X0 Y0 X1 Y1", help="The map's bounds, metres.")
+    ] = "auto",
+    scan_topic: Annotated[str | None, typer.Option(metavar="T", help="The topic of scans.")] = None,
+    odom_topic: Annotated[str | None, typer.Option(metavar="T", help="The topic of poses.")] = None,
+    start: Annotated[float | None, typer.Option(metavar="S", help="Begin S seconds into the log.")] = None,
+    end: Annotated[float | None, typer.Option(metavar="S", help="End S seconds into the log.")] = None,
+    duration: Annotated[float | None, typer.Option(metavar="S", help="Replay S seconds.")] = None,
+    n_scans: Annotated[int | None, typer.Option(metavar="N", help="Replay N scans.")] = None,
+    stride: Annotated[int, typer.Option(metavar="N", help="Replay every N-th scan.")] = 1,
+    rate: Annotated[
+        float | None, typer.Option(metavar="R", help="Hold the replay to R times the log's speed.")
+    ] = None,
+    laser_offset: Annotated[
+        tuple[float, float, float] | None,
+        typer.Option(metavar="X Y DEG", help="Where the laser is mounted on the robot."),
+    ] = None,
+    standing_still: Annotated[
+        bool, typer.Option("--standing-still", help="The robot does not move: map without poses.")
+    ] = False,
+    map_every: Annotated[
+        int | None, typer.Option(metavar="N", help="Show the map every N scans. [default: about 50 times]")
+    ] = None,
+    save: Annotated[Path | None, typer.Option(metavar="OUT.rrd", help="Save the rerun recording here.")] = None,
+    spawn: Annotated[bool, typer.Option("--spawn", help="Open a rerun viewer and show the replay.")] = False,
+    connect: Annotated[
+        str | None, typer.Option(metavar="URL", help="Show the replay in a viewer that runs at URL.")
+    ] = None,
+    serve: Annotated[bool, typer.Option("--serve", help="Serve the replay to web browsers.")] = False,
+    no_viewer: Annotated[bool, typer.Option("--no-viewer", help="Make no rerun recording.")] = False,
+    report: Annotated[Path | None, typer.Option(metavar="OUT.json", help="Where the report goes.")] = None,
+    map_output: Annotated[
+        Path | None, typer.Option("--map", metavar="OUT", help="Write OUT.pgm and OUT.yaml for nav2.")
+    ] = None,
+    trajectory: Annotated[
+        Path | None, typer.Option(metavar="OUT.tum", help="Write the laser's poses in TUM's format.")
+    ] = None,
+    recover: Annotated[bool, typer.Option("--recover", help="Read what is left of a damaged log.")] = False,
+    quiet: Annotated[bool, typer.Option("--quiet", help="Print errors only.")] = False,
+    verbose: Annotated[bool, typer.Option("--verbose", help="Say where the time goes.")] = False,
+    debug: Annotated[bool, typer.Option("--debug", help="Show tracebacks.")] = False,
+    version: Annotated[
+        bool, typer.Option("--version", callback=_show_version, is_eager=True, help="Print the version.")
+    ] = False,
+) -> int:
+    """Replay MCAP logs of a 2D LiDAR through an occupancy mapper and look at the result in rerun.
+
+    Each log leaves a recording and a report in this folder: NAME.MAPPER.rrd and NAME.MAPPER.report.json.
+    """
+    from prim.frames import Pose2D
+    from replay.pipeline import ReplayOptions
+    from replay.scans import Selection
+    from replay.show import ViewerOptions
+
+    outputs = Outputs(save, report, map_output, trajectory)
+    outputs.check(len(logs))
+    shown = ViewerOptions(save, spawn, connect, serve, live=rate is not None)
+    if no_viewer and shown != ViewerOptions(live=shown.live):
+        raise UsageError("--no-viewer excludes --save, --spawn, --connect and --serve")
+    offset = Pose2D(laser_offset[0], laser_offset[1], math.radians(laser_offset[2])) if laser_offset else None
+    options = ReplayOptions(
+        mapper=mapper.value,
+        pose=pose.value,
+        resolution=resolution,
+        bounds=_parse_bounds(bounds),
+        scan_topic=scan_topic,
+        odom_topic=odom_topic,
+        laser_offset=offset,
+        standing_still=standing_still,
+        selection=Selection(start, end, duration, n_scans, stride),
+        rate=rate,
+        map_every=map_every,
+        recover=recover,
+    )
+    codes = []
+    for log in logs:
+        named = outputs.named_after(log, mapper.value, with_recording=not (no_viewer or shown.watched))
+        viewer = None if no_viewer else dataclasses.replace(shown, save=named.recording)
+        codes.append(_replay_log(log, options, named, viewer, Talk(quiet, verbose)))
+    return max(codes)
+
+
+@dataclass(frozen=True)
+class Outputs:
+    """The files a replay leaves; None for those that are not wanted or not named yet."""
+
+    recording: Path | None
+    report: Path | None
+    map: Path | None
+    trajectory: Path | None
+
+    def check(self, logs: int) -> None:
+        """Raises UsageError where several logs would write one file."""
+        named = [option for option in dataclasses.astuple(self) if option is not None]
+        if logs > 1 and named:
+            raise UsageError(f"{logs} logs cannot all write {named[0]}: replay them one by one to name their outputs")
+
+    def named_after(self, log: Path, mapper: str, with_recording: bool) -> Outputs:
+        """Those of one log: what is not named gets a name in this folder."""
+        stem = f"{log.resolve().name.removesuffix('.part').removesuffix('.mcap')}.{mapper}"
+        recording = self.recording or (Path(f"{stem}.rrd") if with_recording else None)
+        return dataclasses.replace(self, recording=recording, report=self.report or Path(f"{stem}.report.json"))
+
+
+@dataclass(frozen=True)
+class Talk:
+    """How much is said on the terminal."""
+
+    quiet: bool
+    verbose: bool
+
+
+def _replay_log(
+    log: Path, options: ReplayOptions, outputs: Outputs, shown: ViewerOptions | None, talk: Talk
+) -> int:
+    """Replays one log, writes its outputs, prints its table; returns the exit code."""
+    from replay.pipeline import Pipeline
+    from replay.report import write_map, write_report, write_trajectory
+
+    viewer = _make_viewer(shown)
+    with _progress_bar(talk.quiet) as progress:
+        result = Pipeline(log, options, viewer, progress).run()
+    if outputs.report:
+        write_report(outputs.report, result)
+    if outputs.map:
+        write_map(outputs.map, result.grid)
+    if outputs.trajectory:
+        write_trajectory(outputs.trajectory, result)
+    if not talk.quiet:
+        _print_result(result, outputs, talk.verbose)
+    if shown is not None and shown.serve:
+        _keep_serving()
+    return PARTLY_LOST if result.lost else 0
+
+
+def _make_viewer(shown: ViewerOptions | None) -> Viewer | None:
+    if shown is None:
+        return None
+    from replay.viewer import RerunViewer
+
+    viewer = RerunViewer(shown)
+    if viewer.url:
+        typer.echo(f"serving; in a browser: {viewer.web_url}   or: rerun {viewer.url}", err=True)
+    return viewer
+
+
+@contextmanager
+def _progress_bar(quiet: bool) -> Iterator[Progress | None]:
+    """A bar on the terminal while scans are replayed; none where nobody looks."""
+    if quiet or not sys.stderr.isatty():
+        yield None
+        return
+    from rich.console import Console
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+    columns = (TextColumn("scans"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+    with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
+        task = bar.add_task("scans", total=None)
+        yield lambda done, total: bar.update(task, completed=done, total=total)
+
+
+def _print_result(result: ReplayResult, outputs: Outputs, verbose: bool) -> None:
+    from rich.console import Console
+    from rich.table import Table
+
+    from replay.report import table
+
+    for note in result.notes:
+        typer.echo(f"note: {note}", err=True)
+    rows = Table(show_header=False, box=None, pad_edge=False)
+    for name, value in table(result):
+        rows.add_row(name, value)
+    if verbose:
+        for name, seconds in result.seconds.items():
+            rows.add_row(name, f"{seconds:.3f} s")
+    Console(highlight=False, soft_wrap=True).print(rows)
+    written = [path for path in (outputs.report, outputs.map, outputs.trajectory) if path]
+    typer.echo("wrote: " + ", ".join(str(path) for path in written))
+    if outputs.recording:
+        typer.echo(f"look:  rerun {outputs.recording}")
+
+
+def _keep_serving() -> None:
+    typer.echo("the replay is done and still served: Ctrl-C ends it", err=True)
+    with suppress(KeyboardInterrupt):
+        while True:
+            time.sleep(3600)
+
+
+def join_bounds(arguments: Sequence[str]) -> list[str]:
+    """Makes the four numbers after ``--bounds`` one argument, since an option takes a fixed number of them."""
+    joined = list(arguments)
+    if "--bounds" in joined:
+        at = joined.index("--bounds") + 1
+        numbers = joined[at : at + 4]
+        if len(numbers) == 4 and all(_is_number(number) for number in numbers):
+            joined[at : at + 4] = [" ".join(numbers)]
+    return joined
+
+
+def _parse_bounds(text: str) -> Bounds | None:
+    if text == "auto":
+        return None
+    numbers = text.split()
+    if len(numbers) != 4 or not all(_is_number(number) for number in numbers):
+        raise UsageError(f"--bounds {text}: give auto, or four numbers X0 Y0 X1 Y1")
+    x0, y0, x1, y1 = (float(number) for number in numbers)
+    return x0, y0, x1, y1
+
+
+def _is_number(text: str) -> bool:
+    try:
+        return math.isfinite(float(text))
+    except ValueError:
+        return False
+
+
+def main() -> None:
+    """The entry point."""
+    sys.exit(console.run(app, "prim-replay", join_bounds(sys.argv[1:])))

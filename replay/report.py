@@ -1,0 +1,138 @@
+"""What a replay leaves behind: the JSON report, the nav2 map, the trajectory, the table."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from mapping.grid import OccupancyGrid
+from prim.errors import OutputError
+from replay.pipeline import ReplayResult
+
+SCHEMA = "prim-replay/1"
+
+FREE_THRESHOLD, OCCUPIED_THRESHOLD = 0.196, 0.65
+"""nav2's map_server calls cells below the one free and above the other occupied; 205 is 0.19608, unknown."""
+
+
+def report(result: ReplayResult) -> dict[str, Any]:
+    """The report as DESIGN section 7 has it (schema ``prim-replay/1``)."""
+    frame = result.grid.frame
+    seconds = result.seconds
+    rmse = result.pose_rmse or (None, None)
+    return {
+        "schema": SCHEMA,
+        "log": {
+            "path": str(result.path),
+            "duration_s": result.duration,
+            "scans": result.scans,
+            "scans_used": result.scans_used,
+            "rays": result.rays,
+            "messages_lost": result.messages_lost,
+            "recovered": bool(result.lost),
+        },
+        "pose": {"source": result.poses.source, "rmse_m": rmse[0], "rmse_rad": rmse[1]},
+        "map": {
+            "mapper": result.options.mapper,
+            "resolution_m": frame.resolution,
+            "origin_m": list(frame.origin),
+            "cells": [frame.rows, frame.cols],
+            "noise_std_m": None,
+            "scores": result.scores.to_json() if result.scores else None,
+        },
+        "primitives": [],
+        "errors": None,
+        "timing": {f"{name}_s": value for name, value in seconds.items()}
+        | {
+            "rays_per_s": result.rays / seconds["map"] if seconds["map"] else None,
+            "x_realtime": result.duration / seconds["total"] if seconds["total"] else None,
+        },
+    }
+
+
+def write_report(path: Path, result: ReplayResult) -> None:
+    """Writes the report as JSON. Raises OutputError."""
+    with _writing(path):
+        path.write_text(json.dumps(report(result), indent=2) + "\n", encoding="utf-8")
+
+
+def write_map(stem: Path, grid: OccupancyGrid) -> None:
+    """Writes ``stem.pgm`` and ``stem.yaml`` as nav2's map_server reads them. Raises OutputError.
+
+    An image's first row is the map's largest y. Cells called occupied are black, free ones white, unknown
+    ones 205, which its ``trinary`` mode reads back as they were.
+    """
+    image = np.full(grid.frame.shape, 205, dtype=np.uint8)
+    image[grid.free] = 254
+    image[grid.occupied] = 0
+    rows, cols = grid.frame.shape
+    pgm, yaml = _with_suffix(stem, ".pgm"), _with_suffix(stem, ".yaml")
+    x, y = grid.frame.origin
+    with _writing(pgm):
+        pgm.write_bytes(f"P5\n{cols} {rows}\n255\n".encode() + np.flipud(image).tobytes())
+    with _writing(yaml):
+        yaml.write_text(
+            f"image: {pgm.name}\nmode: trinary\nresolution: {grid.frame.resolution:g}\n"
+            f"origin: [{x:.9g}, {y:.9g}, 0]\nnegate: 0\n"
+            f"occupied_thresh: {OCCUPIED_THRESHOLD}\nfree_thresh: {FREE_THRESHOLD}\n",
+            encoding="utf-8",
+        )
+
+
+def write_trajectory(path: Path, result: ReplayResult) -> None:
+    """Writes the laser's poses in TUM's format (stamp x y z qx qy qz qw). Raises OutputError."""
+    lines = []
+    for stamp, pose, valid in zip(result.stamps.tolist(), result.poses.poses, result.poses.valid, strict=True):
+        if valid:
+            x, y, half = pose[0], pose[1], pose[2] / 2
+            seconds = f"{stamp // 10**9}.{stamp % 10**9:09d}"
+            lines.append(f"{seconds} {x:.9f} {y:.9f} 0 0 0 {np.sin(half):.9f} {np.cos(half):.9f}\n")
+    with _writing(path):
+        path.write_text("".join(lines), encoding="utf-8")
+
+
+def table(result: ReplayResult) -> list[tuple[str, str]]:
+    """The rows of the short table at the end: name, value with its unit."""
+    frame, seconds, scores = result.grid.frame, result.seconds, result.scores
+    x0, y0, x1, y1 = frame.bounds
+    used = f"{result.scans_used} of {result.scans}" if result.scans_used != result.scans else f"{result.scans}"
+    rows = [
+        ("log", f"{result.path.name}, {result.duration:.1f} s, {used} scans, {result.rays:,} rays"),
+        ("poses", f"{result.poses.source} ({result.poses.origin})"),
+        ("map", f"{result.options.mapper}, {frame.cols} x {frame.rows} cells of {frame.resolution:g} m"),
+        ("", f"x {x0:.2f} to {x1:.2f} m, y {y0:.2f} to {y1:.2f} m"),
+    ]
+    if result.pose_rmse is not None:
+        metres, radians = result.pose_rmse
+        rows.append(("pose error", f"{metres * 1000:.1f} mm, {np.degrees(radians):.2f} deg (RMS)"))
+    if scores is not None:
+        rows += [
+            ("occupied", f"precision {_percent(scores.occupied_precision)}, recall {_percent(scores.occupied_recall)}, "
+             f"F1 {_percent(scores.occupied_f1)} (within one cell)"),
+            ("free", f"{_percent(scores.free_accuracy)} right"),
+            ("AUC", "-" if scores.auc is None else f"{scores.auc:.4f}"),
+        ]  # fmt: skip
+    rate = result.rays / seconds["map"] / 1e6 if seconds["map"] else 0.0
+    rows.append(("time", f"{seconds['total']:.2f} s, mapping {seconds['map']:.3f} s ({rate:.2f} M rays/s)"))
+    return rows
+
+
+def _percent(share: float | None) -> str:
+    return "-" if share is None else f"{share:.1%}"
+
+
+def _with_suffix(stem: Path, suffix: str) -> Path:
+    return stem.with_name(stem.name.removesuffix(".yaml").removesuffix(".pgm") + suffix)
+
+
+@contextmanager
+def _writing(path: Path) -> Iterator[None]:
+    try:
+        yield
+    except OSError as error:
+        raise OutputError(path, error) from error

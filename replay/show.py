@@ -1,0 +1,96 @@
+"""What a replay shows while it runs, and a viewer that shows nothing."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Protocol
+
+from mapping.grid import OccupancyGrid
+from prim.errors import UsageError
+from prim.frames import Pose2D
+from prim.metrics import MapScores
+from prim.shapes import FloatArray
+from prim.world import Bounds, World
+
+if TYPE_CHECKING:
+    from replay.pipeline import ReplayResult
+
+
+@dataclass(frozen=True)
+class ViewerOptions:
+    """Where a recording goes: a file, a new viewer, a viewer that runs at a URL, or web browsers.
+
+    ``live`` sends every scan at once, as a replay that is held to a rate wants it. Raises UsageError.
+    """
+
+    save: Path | None = None
+    spawn: bool = False
+    connect: str | None = None
+    serve: bool = False
+    live: bool = False
+
+    def __post_init__(self) -> None:
+        if self.serve and (self.save or self.spawn or self.connect):
+            raise UsageError("--serve excludes --save, --spawn and --connect")
+        if self.spawn and self.connect:
+            raise UsageError("--spawn and --connect exclude each other")
+
+    @property
+    def watched(self) -> bool:
+        """Whether somebody may look at the replay while it runs."""
+        return self.spawn or self.serve or self.connect is not None
+
+
+@dataclass(frozen=True)
+class Scene:
+    """What is known before the first scan: the log's name, the mapper, the map's bounds (m), the true world."""
+
+    log: str
+    mapper: str
+    bounds: Bounds
+    world: World | None
+
+
+class Viewer(Protocol):
+    """Shows a replay on a timeline; ``position`` counts the scans, ``stamp`` is in ns."""
+
+    def begin(self, scene: Scene) -> None:
+        """Sets the scene."""
+
+    def show_scan(self, position: int, stamp: int, pose: Pose2D, points: FloatArray, seconds: float) -> None:
+        """A scan's end points (N, 2) in the map frame, the laser's pose, and the mapper's seconds for it."""
+
+    def show_map(self, position: int, stamp: int, grid: OccupancyGrid, scores: MapScores | None) -> None:
+        """The map so far and its scores against the truth."""
+
+    def show_pose_error(self, position: int, stamp: int, metres: float, radians: float) -> None:
+        """How far the pose in use is from the true one."""
+
+    def event(self, position: int, stamp: int, text: str, warning: bool = False) -> None:
+        """A line for the log of events."""
+
+    def finish(self, result: ReplayResult) -> None:
+        """The result; nothing is shown after it."""
+
+
+class NullViewer:
+    """Shows nothing."""
+
+    def begin(self, scene: Scene) -> None:
+        """Nothing."""
+
+    def show_scan(self, position: int, stamp: int, pose: Pose2D, points: FloatArray, seconds: float) -> None:
+        """Nothing."""
+
+    def show_map(self, position: int, stamp: int, grid: OccupancyGrid, scores: MapScores | None) -> None:
+        """Nothing."""
+
+    def show_pose_error(self, position: int, stamp: int, metres: float, radians: float) -> None:
+        """Nothing."""
+
+    def event(self, position: int, stamp: int, text: str, warning: bool = False) -> None:
+        """Nothing."""
+
+    def finish(self, result: ReplayResult) -> None:
+        """Nothing."""
