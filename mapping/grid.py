@@ -110,7 +110,7 @@ class OccupancyGrid:
         """Centres (N, 2) in metres of the marked cells."""
         rows, cols = np.nonzero(cells)
         corner = np.column_stack((cols + self.frame.col, rows + self.frame.row))
-        return (corner + 0.5) * self.frame.resolution
+        return np.asarray((corner + 0.5) * self.frame.resolution, dtype=np.float64)
 
 
 class Layer:

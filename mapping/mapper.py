@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from typing import Protocol
 
+import numpy as np
+
 from mapping.deterministic import DeterministicMapper
 from mapping.grid import OccupancyGrid
 from mapping.probabilistic import ProbabilisticMapper
@@ -33,7 +35,11 @@ MAPPERS: dict[str, type[DeterministicMapper] | type[ProbabilisticMapper]] = {
 
 
 def make_mapper(name: str, resolution: float, bounds: Bounds | None = None) -> Mapper:
-    """A mapper by name, over given or growing ``bounds`` (m). Raises UsageError."""
+    """A mapper by name, over given or growing ``bounds`` (m), its kernels compiled. Raises UsageError."""
     if name not in MAPPERS:
         raise UsageError(f"there is no mapper {name!r}: choose from {', '.join(MAPPERS)}")
+    MAPPERS[name](1.0, (0.0, 0.0, 1.0, 1.0)).update(_NO_RAYS, Pose2D())
     return MAPPERS[name](resolution, bounds)
+
+
+_NO_RAYS = Scan(0, "", 0.0, 0.0, 0.0, 1.0, np.zeros(0, dtype=np.float32))

@@ -24,7 +24,7 @@ _TABLE_STEPS = 600
 def log_odds(probability: FloatArray | float) -> FloatArray:
     """Eq. 1: ln(p / (1 - p))."""
     p = np.asarray(probability, dtype=float)
-    return np.log(p / (1 - p))
+    return np.asarray(np.log(p / (1 - p)))
 
 
 def probability_of(odds: NDArray[np.floating]) -> NDArray[np.float32]:
@@ -38,7 +38,7 @@ def inverse_sensor_model(d: FloatArray | float) -> FloatArray:
 
     0.3 up to 0.03 m before it, linear up to 0.9 at it, linear down to 0.5 at 0.03 m behind it, 0.5 beyond.
     """
-    return np.interp(d, [-REACH, 0.0, REACH], [FREE_PROBABILITY, HIT_PROBABILITY, 0.5])
+    return np.asarray(np.interp(d, [-REACH, 0.0, REACH], [FREE_PROBABILITY, HIT_PROBABILITY, 0.5]))
 
 
 class ProbabilisticMapper:

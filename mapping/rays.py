@@ -40,7 +40,7 @@ def classify(z: float, range_min: float, range_max: float) -> int:
 @inline
 def cell(coordinate: float, inverse_resolution: float) -> int:
     """As mapping.grid.cell_of."""
-    return int(math.floor(coordinate * inverse_resolution + BORDER_SLACK))
+    return math.floor(coordinate * inverse_resolution + BORDER_SLACK)
 
 
 @inline
@@ -114,7 +114,14 @@ def end_extent(
 
 @kernel
 def mark(
-    states: Any, row0: int, col0: int, ranges: Any, directions: Any, pose: Any, limits: Any, inverse_resolution: float
+    states: Any,
+    row0: int,
+    col0: int,
+    ranges: Any,
+    directions: Any,
+    pose: Any,
+    limits: Any,
+    inverse_resolution: float,
 ) -> Any:
     """One scan into a grid of states (the paper's III-A): first all rays free their cells, then hits are marked.
 
@@ -204,8 +211,10 @@ def add_log_odds(
         plain = last = steps
         if kind == HIT:
             along_x = major == 1 or major == -1
-            last = steps_to(x, col + col0, z + reach, dx, inverse_resolution) if along_x else steps_to(
-                y, row + row0, z + reach, dy, inverse_resolution
+            last = (
+                steps_to(x, col + col0, z + reach, dx, inverse_resolution)
+                if along_x
+                else steps_to(y, row + row0, z + reach, dy, inverse_resolution)
             )
             plain = int(steps * (1 - (reach + 1.25 * resolution) / z)) if z > reach else -1
         first, last = clip(row, col, rows, cols, major, tilt, minor, last)
@@ -219,9 +228,7 @@ def add_log_odds(
         for _ in range(max(first, plain + 1), last + 1):
             place = position + (offset >> SHIFT) * minor
             cell_row = place // cols
-            distance = math.hypot(
-                (place - cell_row * cols) * resolution + centre_x, cell_row * resolution + centre_y
-            )
+            distance = math.hypot((place - cell_row * cols) * resolution + centre_x, cell_row * resolution + centre_y)
             flat[np.uintp(place)] += model(distance - z, free, reach, table, scale)
             position += major
             offset += tilt

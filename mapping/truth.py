@@ -53,7 +53,8 @@ class TruthMap:
     @property
     def free(self) -> NDArray[np.bool_]:
         """Cells that a ray crosses, more than one cell away from any occupied one (rows, cols)."""
-        return (self._states != UNSEEN) & ~dilate(self._occupied, 1)
+        crossed: NDArray[np.bool_] = self._states != UNSEEN
+        return crossed & ~dilate(self._occupied, 1)
 
     def score(self, probability: NDArray[np.float32]) -> MapScores:
         """Scores of a map on the same frame."""

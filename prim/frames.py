@@ -35,9 +35,7 @@ class Pose2D:
             self._compose_covariance(child, dx, dy, cos, sin),
         )
 
-    def _compose_covariance(
-        self, child: Pose2D, dx: float, dy: float, cos: float, sin: float
-    ) -> FloatArray | None:
+    def _compose_covariance(self, child: Pose2D, dx: float, dy: float, cos: float, sin: float) -> FloatArray | None:
         if self.covariance is None and child.covariance is None:
             return None
         total = np.zeros((3, 3))
@@ -57,7 +55,9 @@ class Pose2D:
     def apply(self, points: ArrayLike) -> FloatArray:
         """Points (N, 2) of this frame in the parent frame."""
         cos, sin = math.cos(self.theta), math.sin(self.theta)
-        return np.asarray(points) @ np.array([[cos, sin], [-sin, cos]]) + (self.x, self.y)
+        moved: FloatArray = np.asarray(points) @ np.array([[cos, sin], [-sin, cos]])
+        moved += self.x, self.y
+        return moved
 
 
 @dataclass(frozen=True, slots=True)

@@ -49,7 +49,7 @@ class Topic(NamedTuple):
     name: str
     type: str
     encoding: str
-    count: int
+    messages: int
 
 
 class Message(NamedTuple):
@@ -104,7 +104,7 @@ class LogReader:
             schema = self._contents.schemas.get(channel.schema_id)
             count = self._contents.counts[channel.id]
             if channel.topic in topics:
-                count += topics[channel.topic].count
+                count += topics[channel.topic].messages
             name = schema.name if schema else ""
             topics[channel.topic] = Topic(channel.topic, _ros2_name(name), channel.message_encoding, count)
         return topics
@@ -141,7 +141,7 @@ class LogReader:
 
     def of_type(self, *types: str) -> list[Topic]:
         """The topics that carry messages of any of these types and are not empty, by name."""
-        fitting = (topic for topic in self.topics.values() if topic.type in types and topic.count)
+        fitting = (topic for topic in self.topics.values() if topic.type in types and topic.messages)
         return sorted(fitting, key=lambda topic: topic.name)
 
     def messages(self, *topics: str) -> Iterator[Message]:
@@ -155,13 +155,11 @@ class LogReader:
                 delivered[channel.topic] += 1
                 yield Message(channel.topic, message.log_time, message.data)
         for name in topics:
-            if name in self.topics and delivered[name] != self.topics[name].count:
-                what = f"{name} has {delivered[name]} messages where the summary counts {self.topics[name].count}"
+            if name in self.topics and delivered[name] != self.topics[name].messages:
+                what = f"{name} has {delivered[name]} messages where the summary counts {self.topics[name].messages}"
                 raise LogReadError(self.path, f"damaged: {what}", _SALVAGE)
 
-    def decoded(
-        self, topic: Topic, decode: Callable[[bytes], Decoded]
-    ) -> Iterator[tuple[int, Decoded]]:
+    def decoded(self, topic: Topic, decode: Callable[[bytes], Decoded]) -> Iterator[tuple[int, Decoded]]:
         """Log time (ns) and decoded message of one topic. Raises LogReadError on messages that do not decode."""
         if topic.encoding != "cdr":
             raise LogReadError(
@@ -290,9 +288,7 @@ class LogWriter:
             self._file = self.part.open("wb")
         except OSError as error:
             raise OutputError(path, error) from error
-        self._writer = Writer(
-            self._file, chunk_size=CHUNK_BYTES, compression=CompressionType.ZSTD, enable_crcs=True
-        )
+        self._writer = Writer(self._file, chunk_size=CHUNK_BYTES, compression=CompressionType.ZSTD, enable_crcs=True)
         self._writer.start(profile="ros2", library="prim")
         self._channels: dict[str, int] = {}
 
@@ -306,7 +302,7 @@ class LogWriter:
         traceback: TracebackType | None,
     ) -> None:
         try:
-            self._writer.finish()
+            self._writer.finish()  # type: ignore[no-untyped-call]
             self._file.flush()
             os.fsync(self._file.fileno())
             self._file.close()
@@ -327,9 +323,7 @@ class LogWriter:
         """Announces a topic; the messages of a ``latched`` one reach late subscribers when it is played back."""
         schema = self._writer.register_schema(type_name, "ros2msg", message_definition(type_name).encode())
         profile = _LATCHED_QOS if latched else "[]"
-        self._channels[topic] = self._writer.register_channel(
-            topic, "cdr", schema, {"offered_qos_profiles": profile}
-        )
+        self._channels[topic] = self._writer.register_channel(topic, "cdr", schema, {"offered_qos_profiles": profile})
 
     def write(self, topic: str, stamp: int, data: bytes) -> None:
         """Writes one CDR message, logged and published at ``stamp`` (ns)."""
@@ -407,7 +401,9 @@ def _explained(path: Path) -> Iterator[None]:
     except LogReadError:
         raise
     except CRCValidationError as error:
-        raise LogReadError(path, f"damaged: the CRC of a {type(error.record).__name__} does not fit", _SALVAGE) from error
+        raise LogReadError(
+            path, f"damaged: the CRC of a {type(error.record).__name__} does not fit", _SALVAGE
+        ) from error
     except (EndOfFile, RecordLengthLimitExceeded) as error:
         raise LogReadError(path, "truncated or damaged: a record runs past the end", _SALVAGE) from error
     except InvalidMagic as error:
@@ -418,4 +414,3 @@ def _explained(path: Path) -> Iterator[None]:
         raise LogReadError(path, f"cannot be read: {error.strerror or error}", _SALVAGE) from error
     except Exception as error:  # struct.error, KeyError, ZstdError, UnicodeDecodeError, ...: the file is damaged
         raise LogReadError(path, f"damaged: {error or type(error).__name__}", _SALVAGE) from error
-

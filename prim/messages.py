@@ -241,16 +241,11 @@ def planar(pose: StampedPose) -> Pose2D:
 
 
 POSE_DECODERS: dict[str, Callable[[Any], list[StampedPose]]] = {
-    ODOMETRY_TYPE: lambda m: [
-        _stamped(m.header, m.child_frame_id, m.pose.pose.position, m.pose.pose.orientation)
-    ],
+    ODOMETRY_TYPE: lambda m: [_stamped(m.header, m.child_frame_id, m.pose.pose.position, m.pose.pose.orientation)],
     POSE_TYPE: lambda m: [_stamped(m.header, "", m.pose.position, m.pose.orientation)],
-    POSE_WITH_COVARIANCE_TYPE: lambda m: [
-        _stamped(m.header, "", m.pose.pose.position, m.pose.pose.orientation)
-    ],
+    POSE_WITH_COVARIANCE_TYPE: lambda m: [_stamped(m.header, "", m.pose.pose.position, m.pose.pose.orientation)],
     TF_TYPE: lambda m: [
-        _stamped(t.header, t.child_frame_id, t.transform.translation, t.transform.rotation)
-        for t in m.transforms
+        _stamped(t.header, t.child_frame_id, t.transform.translation, t.transform.rotation) for t in m.transforms
     ],
 }
 """Message types that hold poses, and how to read them."""
@@ -289,9 +284,7 @@ def _quaternion(theta: float) -> Any:
 
 
 def _pose(pose: Pose2D) -> Any:
-    return _new(
-        "geometry_msgs/msg/Pose", position=_point(pose.x, pose.y), orientation=_quaternion(pose.theta)
-    )
+    return _new("geometry_msgs/msg/Pose", position=_point(pose.x, pose.y), orientation=_quaternion(pose.theta))
 
 
 def _transform(stamp: int, parent: str, child: str, pose: Pose2D) -> Any:
@@ -358,9 +351,7 @@ def _marker(
         points=[_point(x, y) for x, y in points],
         colors=[],
         texture_resource="",
-        texture=_new(
-            "sensor_msgs/msg/CompressedImage", header=_header(0, ""), format="", data=np.zeros(0, np.uint8)
-        ),
+        texture=_new("sensor_msgs/msg/CompressedImage", header=_header(0, ""), format="", data=np.zeros(0, np.uint8)),
         uv_coordinates=[],
         text=text,
         mesh_resource="",

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass
+from typing import SupportsInt
 
 import numpy as np
 import shapely
@@ -77,7 +78,7 @@ def polygon_iou(a: Primitive, b: Primitive) -> float:
     """Intersection over union of two outlines' polygons."""
     first, second = shapely.Polygon(a.outline()), shapely.Polygon(b.outline())
     shared: float = first.intersection(second).area
-    return shared / (first.area + second.area - shared)
+    return shared / (float(first.area) + float(second.area) - shared)
 
 
 def match_primitives(detections: Sequence[Primitive], truth: Sequence[Primitive]) -> list[Pair]:
@@ -198,8 +199,8 @@ def _f1(precision: float, recall: float) -> float:
     return 2 * precision * recall / (precision + recall) if precision + recall else 0.0
 
 
-def _share(part: int, whole: int) -> float | None:
-    return part / whole if whole else None
+def _share(part: SupportsInt, whole: SupportsInt) -> float | None:
+    return int(part) / int(whole) if int(whole) else None
 
 
 def _mean(values: Iterable[float]) -> float | None:

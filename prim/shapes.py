@@ -151,7 +151,9 @@ class Primitive:
     def outline(self, points: int = OUTLINE_POINTS) -> FloatArray:
         """Counter-clockwise vertices in the map frame, (N, 2) in metres, the first not repeated."""
         cos, sin = math.cos(self.theta or 0.0), math.sin(self.theta or 0.0)
-        return self.local_outline(points) @ np.array([[cos, sin], [-sin, cos]]) + (self.x, self.y)
+        outline: FloatArray = self.local_outline(points) @ np.array([[cos, sin], [-sin, cos]])
+        outline += self.x, self.y
+        return outline
 
     def cast(self, origin: tuple[float, float], directions: FloatArray) -> FloatArray:
         """Exact distances (m) from ``origin`` along unit ``directions`` (N, 2), map frame; inf for a miss.
@@ -189,7 +191,7 @@ class Primitive:
 
 
 def angle_difference(a: float, b: float, period: float = 2 * math.pi) -> float:
-    """a - b (rad) modulo ``period``, in [-period/2, period/2)."""
+    """A - b (rad) modulo ``period``, in [-period/2, period/2)."""
     return (a - b + period / 2) % period - period / 2
 
 

@@ -99,4 +99,5 @@ def _cast_walls(origin: tuple[float, float], directions: FloatArray, walls: Sequ
         distance = (towards[:, 0] * along[:, 1] - towards[:, 1] * along[:, 0]) / cross
         share = (towards[:, 0] * directions[:, 1:] - towards[:, 1] * directions[:, :1]) / cross
     hits = (cross != 0) & (distance >= 0) & (share >= -1e-12) & (share <= 1 + 1e-12)
-    return np.where(hits, distance, np.inf).min(axis=1)
+    nearest: FloatArray = np.where(hits, distance, np.inf).min(axis=1)
+    return nearest

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import sys
 from collections import Counter
+from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -21,6 +22,13 @@ PAPER_NOISE_UNIT = 5.0
 """``--noise 1`` is a standard deviation of this many metres (the paper's IV-A)."""
 
 KINDS = "square,rectangle,circle,triangle,ellipse"
+
+
+class MotionName(StrEnum):
+    """The ways the robot moves."""
+
+    WARP = "warp"
+
 
 app = typer.Typer(add_completion=False, rich_markup_mode=None)
 
@@ -42,6 +50,7 @@ def record(
     per_kind: Annotated[
         str, typer.Option(metavar="N or A-B", help="How many of each kind: a number or a range.")
     ] = "0-2",
+    motion: Annotated[MotionName, typer.Option(help="How the robot moves.")] = MotionName.WARP,
     stops: Annotated[
         tuple[int, int], typer.Option(metavar="COLS ROWS", help="The grid of places the robot is warped to.")
     ] = (10, 10),
@@ -82,6 +91,7 @@ def record(
         seed=seed,
         world=WorldOptions(size, _kinds(kinds), _per_kind(per_kind), walls),
         world_file=world,
+        motion=motion.value,
         stops=stops,
         rate=rate,
         lidar=Lidar(rays, _fov_radians(fov), range_min, range_max, _noise_std(noise, noise_std)),

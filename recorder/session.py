@@ -68,6 +68,7 @@ class SessionOptions:
     seed: int = 0
     world: WorldOptions = field(default_factory=WorldOptions)
     world_file: Path | None = None
+    motion: str = "warp"
     stops: tuple[int, int] = (10, 10)
     rate: float = 10.0
     lidar: Lidar = field(default_factory=Lidar)
@@ -131,9 +132,7 @@ def _begin(log: LogWriter, options: SessionOptions, world: World) -> None:
     log.write(TRUE_PRIMITIVES_TOPIC, START, encode_primitives(START, world))
 
 
-def _write_sensors(
-    log: LogWriter, stamp: int, pose: Pose2D, options: SessionOptions, streams: _Streams
-) -> None:
+def _write_sensors(log: LogWriter, stamp: int, pose: Pose2D, options: SessionOptions, streams: _Streams) -> None:
     log.write(GPS_TOPIC, stamp, encode_point(stamp, *options.gps.measure(pose, streams.gps)))
     log.write(COMPASS_TOPIC, stamp, encode_compass(stamp, options.compass.measure(pose, streams.compass)))
     log.write(ODOM_TOPIC, stamp, encode_odometry(stamp, pose))
@@ -145,5 +144,4 @@ def _describe(options: SessionOptions) -> dict[str, str]:
     """The recording options as metadata: SI units, JSON values."""
     described = asdict(options)
     described["world_file"] = options.world_file.name if options.world_file else None
-    described["motion"] = "warp"
     return {"version": __version__} | {name: json.dumps(value) for name, value in described.items()}

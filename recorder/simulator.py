@@ -26,12 +26,13 @@ class Simulator:
             self.space.add(body, _shape(primitive, body))
         for x0, y0, x1, y1 in world.walls:
             self.space.add(pymunk.Segment(self.space.static_body, (x0, y0), (x1, y1), 0.0))
-        self._robot = pymunk.Circle(pymunk.Body(body_type=pymunk.Body.KINEMATIC), robot_radius)
+        self._body = pymunk.Body(body_type=pymunk.Body.KINEMATIC)
+        self._robot = pymunk.Circle(self._body, robot_radius)
 
     def warp(self, pose: Pose2D) -> bool:
         """Puts the robot at ``pose``; False where it would stand inside something or touch it."""
-        self._robot.body.position = pose.x, pose.y
-        self._robot.body.angle = pose.theta
+        self._body.position = pose.x, pose.y
+        self._body.angle = pose.theta
         self._robot.cache_bb()
         return not self.space.shape_query(self._robot)
 

@@ -47,9 +47,7 @@ def draw_world(rng: np.random.Generator, options: WorldOptions) -> World:
     )
 
 
-def _place(
-    rng: np.random.Generator, kinds: Sequence[Kind], size: tuple[float, float]
-) -> list[Primitive] | None:
+def _place(rng: np.random.Generator, kinds: Sequence[Kind], size: tuple[float, float]) -> list[Primitive] | None:
     """Primitives of these kinds, apart from each other; None where one found no place."""
     placed: list[Primitive] = []
     outlines: list[shapely.Polygon] = []

@@ -57,9 +57,7 @@ def replay(
     mapper: Annotated[MapperName, typer.Option(help="How the map is made.")] = MapperName.PROB,
     pose: Annotated[PoseName, typer.Option(help="Where poses come from.")] = PoseName.AUTO,
     resolution: Annotated[float, typer.Option(metavar="M", help="Side of a cell, metres.")] = 0.01,
-    bounds: Annotated[
-        str, typer.Option(metavar="auto or X0 Y0 X1 Y1", help="The map's bounds, metres.")
-    ] = "auto",
+    bounds: Annotated[str, typer.Option(metavar="auto or X0 Y0 X1 Y1", help="The map's bounds, metres.")] = "auto",
     scan_topic: Annotated[str | None, typer.Option(metavar="T", help="The topic of scans.")] = None,
     odom_topic: Annotated[str | None, typer.Option(metavar="T", help="The topic of poses.")] = None,
     start: Annotated[float | None, typer.Option(metavar="S", help="Begin S seconds into the log.")] = None,
@@ -148,11 +146,16 @@ class Outputs:
     map: Path | None
     trajectory: Path | None
 
+    @property
+    def named(self) -> list[Path]:
+        """Those that have a name."""
+        return [path for path in dataclasses.astuple(self) if path is not None]
+
     def check(self, logs: int) -> None:
         """Raises UsageError where several logs would write one file."""
-        named = [option for option in dataclasses.astuple(self) if option is not None]
-        if logs > 1 and named:
-            raise UsageError(f"{logs} logs cannot all write {named[0]}: replay them one by one to name their outputs")
+        if logs > 1 and self.named:
+            path = self.named[0]
+            raise UsageError(f"{logs} logs cannot all write {path}: replay them one by one to name their outputs")
 
     def named_after(self, log: Path, mapper: str, with_recording: bool) -> Outputs:
         """Those of one log: what is not named gets a name in this folder."""
@@ -169,13 +172,13 @@ class Talk:
     verbose: bool
 
 
-def _replay_log(
-    log: Path, options: ReplayOptions, outputs: Outputs, shown: ViewerOptions | None, talk: Talk
-) -> int:
+def _replay_log(log: Path, options: ReplayOptions, outputs: Outputs, shown: ViewerOptions | None, talk: Talk) -> int:
     """Replays one log, writes its outputs, prints its table; returns the exit code."""
     from replay.pipeline import Pipeline
-    from replay.report import write_map, write_report, write_trajectory
+    from replay.report import check_writable, write_map, write_report, write_trajectory
 
+    for path in outputs.named:
+        check_writable(path)
     viewer = _make_viewer(shown)
     with _progress_bar(talk.quiet) as progress:
         result = Pipeline(log, options, viewer, progress).run()
@@ -197,10 +200,7 @@ def _make_viewer(shown: ViewerOptions | None) -> Viewer | None:
         return None
     from replay.viewer import RerunViewer
 
-    viewer = RerunViewer(shown)
-    if viewer.url:
-        typer.echo(f"serving; in a browser: {viewer.web_url}   or: rerun {viewer.url}", err=True)
-    return viewer
+    return RerunViewer(shown, announce=lambda line: typer.echo(line, err=True))
 
 
 @contextmanager

@@ -116,9 +116,7 @@ class TransformTree:
             chain.append(self.edges[chain[-1]][0])
         return chain
 
-    def lookup(
-        self, chain: Sequence[str], stamps: Stamps
-    ) -> tuple[FloatArray, FloatArray, NDArray[np.bool_]]:
+    def lookup(self, chain: Sequence[str], stamps: Stamps) -> tuple[FloatArray, FloatArray, NDArray[np.bool_]]:
         """Rotations, translations and validity of the chain's first frame in its last, at ``stamps``."""
         rotation = np.broadcast_to(np.eye(3), (len(stamps), 3, 3))
         translation = np.zeros((len(stamps), 3))
@@ -159,7 +157,7 @@ class Localizer:
         return self._from_odometry(scans, source)
 
     def _has(self, topic: str) -> bool:
-        return topic in self._log.topics and self._log.topics[topic].count > 0
+        return topic in self._log.topics and self._log.topics[topic].messages > 0
 
     def _from_truth(self, scans: ScanTimes) -> LaserPoses:
         if not self._has(TRUE_POSE_TOPIC):
@@ -218,7 +216,10 @@ class Localizer:
         at, valid = Trajectory.from_unsorted(stamps, poses).at(scans.stamps)
         mount, upside_down, notes = self._mount(scans, base or BASE_FRAME)
         if unusable:
-            notes = (*notes, f"{topic.name}: {unusable} poses that are not finite or have no rotation were skipped")
+            notes = (
+                *notes,
+                f"{topic.name}: {unusable} poses that are not finite or have no rotation were skipped",
+            )
         return LaserPoses(source, topic.name, _compose(at, mount), valid, upside_down, notes)
 
     def _mount(self, scans: ScanTimes, base: str) -> tuple[Pose2D, bool, tuple[str, ...]]:
@@ -284,13 +285,11 @@ def _compose(poses: FloatArray, mount: Pose2D) -> FloatArray:
     return np.column_stack((x, y, poses[:, 2] + mount.theta))
 
 
-def _flatten(
-    rotation: FloatArray, translation: FloatArray
-) -> tuple[FloatArray, bool, tuple[str, ...]]:
+def _flatten(rotation: FloatArray, translation: FloatArray) -> tuple[FloatArray, bool, tuple[str, ...]]:
     """3D poses seen from above: x, y, heading of the x axis (N, 3); upside down or not; notes."""
     heading = np.arctan2(rotation[:, 1, 0], rotation[:, 0, 0])
     up = np.median(rotation[:, 2, 2])
-    notes = ()
+    notes: tuple[str, ...] = ()
     if abs(up) < MAX_TILT:
         tilt = np.degrees(np.arccos(min(abs(up), 1.0)))
         notes = (f"the laser is tilted by {tilt:.0f} degrees: the map shows its plane, not the floor plan",)

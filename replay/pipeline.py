@@ -91,9 +91,7 @@ class Clock:
     """Adds up the seconds spent in each stage."""
 
     def __init__(self) -> None:
-        self.seconds: dict[str, float] = dict.fromkeys(
-            ("read", "localize", "map", "detect", "refine", "viewer"), 0.0
-        )
+        self.seconds: dict[str, float] = dict.fromkeys(("read", "localize", "map", "detect", "refine", "viewer"), 0.0)
         self._start = time.perf_counter()
 
     @contextmanager
@@ -137,7 +135,9 @@ class Pipeline:
             frame = self._frame(scans, poses, truth)
             mapper = make_mapper(self.options.mapper, self.options.resolution, frame.bounds)
             judge = Judge(frame, truth, poses, true_poses)
-            self._begin(log, scans, poses, frame, truth)
+            world = truth.world if truth else None
+            scene = Scene(log.path.name, self.options.mapper, frame.bounds, world, judge.compares_poses)
+            self._begin(log, scans, poses, scene)
             rays = self._map_scans(scans, poses, mapper, judge, self._map_every(len(scans), frame))
             with self._clock.stage("map"):
                 grid = mapper.finish()
@@ -149,9 +149,7 @@ class Pipeline:
                 self.viewer.finish(result)
         return result
 
-    def _localize(
-        self, log: LogReader, scans: ScanLog, truth: Truth | None
-    ) -> tuple[LaserPoses, LaserPoses | None]:
+    def _localize(self, log: LogReader, scans: ScanLog, truth: Truth | None) -> tuple[LaserPoses, LaserPoses | None]:
         """The laser's poses, and the true ones where the log has both them and a true world."""
         options = self.options
         if options.standing_still:
@@ -206,11 +204,9 @@ class Pipeline:
         shown = min(MAP_FRAMES, max(1, MAP_FRAME_CELLS // (frame.rows * frame.cols)))
         return self.options.map_every or max(1, -(-scans // shown))
 
-    def _begin(
-        self, log: LogReader, scans: ScanLog, poses: LaserPoses, frame: GridFrame, truth: Truth | None
-    ) -> None:
+    def _begin(self, log: LogReader, scans: ScanLog, poses: LaserPoses, scene: Scene) -> None:
         with self._clock.stage("viewer"):
-            self.viewer.begin(Scene(log.path.name, self.options.mapper, frame.bounds, truth.world if truth else None))
+            self.viewer.begin(scene)
             first = int(scans.stamps[0])
             self.viewer.event(0, first, f"{len(scans)} of {scans.total} scans on {scans.topic.name}")
             self.viewer.event(0, first, f"poses: {poses.source} ({poses.origin})")
@@ -223,12 +219,11 @@ class Pipeline:
         notes = [f"lost: {lost}" for lost in log.lost] + list(poses.notes)
         outside = int(np.count_nonzero(~poses.valid))
         if outside:
-            notes.append(f"{outside} scans lie outside the time of the poses and were not used")
+            scans = "1 scan lies" if outside == 1 else f"{outside} scans lie"
+            notes.append(f"{scans} outside the time of the poses: not used")
         return notes
 
-    def _map_scans(
-        self, scans: ScanLog, poses: LaserPoses, mapper: Mapper, judge: Judge, map_every: int
-    ) -> int:
+    def _map_scans(self, scans: ScanLog, poses: LaserPoses, mapper: Mapper, judge: Judge, map_every: int) -> int:
         """Maps, scores and shows scan by scan; returns the number of rays."""
         rays = 0
         pace = Pace(self.options.rate)
@@ -292,39 +287,38 @@ class Judge:
     ) -> None:
         self._truth = truth
         self._poses = poses
-        self._true_poses = true_poses if truth is not None else None
-        self._map = TruthMap(frame) if self._true_poses is not None else None
+        self._true_poses = true_poses
+        self._map = TruthMap(frame)
+
+    @property
+    def compares_poses(self) -> bool:
+        """Whether the poses are other than the true ones, and held against them."""
+        return self._true_poses is not None and self._poses.source not in ("truth", STILL)
 
     def update(self, position: int, scan: Scan, stamp: int) -> None:
         """Adds what a perfect sensor would have seen."""
-        if self._map is not None and self._truth is not None and self._true_poses is not None:
-            if self._true_poses.valid[position]:
-                pose = Pose2D(*self._true_poses.poses[position].tolist())
-                self._map.update(scan, pose, self._truth.at(stamp))
+        true = self._true_poses
+        if self._truth is not None and true is not None and true.valid[position]:
+            pose = Pose2D(*true.poses[position].tolist())
+            self._map.update(scan, pose, self._truth.at(stamp))
 
     def score(self, grid: OccupancyGrid) -> MapScores | None:
         """Scores of the map so far; None without truth."""
-        return None if self._map is None else self._map.score(grid.probability)
+        return None if self._true_poses is None else self._map.score(grid.probability)
 
     def pose_error(self, position: int) -> tuple[float, float] | None:
-        """Position (m) and heading (rad) error of one scan's pose; None where the poses are the truth."""
-        both = self._both_valid()
-        if both is None or self._true_poses is None or not both[position]:
+        """Position (m) and heading (rad) error of one scan's pose; None where poses are not compared."""
+        if self._true_poses is None or not self.compares_poses or not self._true_poses.valid[position]:
             return None
         pose, true = self._poses.poses[position], self._true_poses.poses[position]
         return float(np.hypot(*(pose - true)[:2])), abs(angle_difference(float(pose[2]), float(true[2])))
 
     def pose_rmse(self) -> tuple[float, float] | None:
-        """Root mean square position (m) and heading (rad) errors; None where the poses are the truth."""
-        both = self._both_valid()
-        if both is None or self._true_poses is None or not both.any():
+        """Root mean square position (m) and heading (rad) errors; None where poses are not compared."""
+        if self._true_poses is None or not self.compares_poses:
             return None
-        return pose_rmse(self._poses.poses[both], self._true_poses.poses[both])
-
-    def _both_valid(self) -> NDArray[np.bool_] | None:
-        if self._true_poses is None or self._poses.source in ("truth", STILL):
-            return None
-        return self._poses.valid & self._true_poses.valid
+        both = self._poses.valid & self._true_poses.valid
+        return pose_rmse(self._poses.poses[both], self._true_poses.poses[both]) if both.any() else None
 
 
 class Pace:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import errno
 import json
+import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -55,6 +57,17 @@ def report(result: ReplayResult) -> dict[str, Any]:
     }
 
 
+def check_writable(path: Path) -> None:
+    """Raises OutputError where a file could not be written, before the work that would be lost."""
+    with _writing(path):
+        if path.is_dir():
+            raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR))
+        if not path.parent.is_dir():
+            raise FileNotFoundError(errno.ENOENT, os.strerror(errno.ENOENT))
+        if not os.access(path if path.exists() else path.parent, os.W_OK):
+            raise PermissionError(errno.EACCES, os.strerror(errno.EACCES))
+
+
 def write_report(path: Path, result: ReplayResult) -> None:
     """Writes the report as JSON. Raises OutputError."""
     with _writing(path):
@@ -105,15 +118,15 @@ def table(result: ReplayResult) -> list[tuple[str, str]]:
         ("log", f"{result.path.name}, {result.duration:.1f} s, {used} scans, {result.rays:,} rays"),
         ("poses", f"{result.poses.source} ({result.poses.origin})"),
         ("map", f"{result.options.mapper}, {frame.cols} x {frame.rows} cells of {frame.resolution:g} m"),
-        ("", f"x {x0:.2f} to {x1:.2f} m, y {y0:.2f} to {y1:.2f} m"),
+        ("bounds", f"x {x0:.2f} to {x1:.2f} m, y {y0:.2f} to {y1:.2f} m"),
     ]
     if result.pose_rmse is not None:
         metres, radians = result.pose_rmse
         rows.append(("pose error", f"{metres * 1000:.1f} mm, {np.degrees(radians):.2f} deg (RMS)"))
     if scores is not None:
         rows += [
-            ("occupied", f"precision {_percent(scores.occupied_precision)}, recall {_percent(scores.occupied_recall)}, "
-             f"F1 {_percent(scores.occupied_f1)} (within one cell)"),
+            ("occupied", f"precision {_percent(scores.occupied_precision)}, recall "
+             f"{_percent(scores.occupied_recall)}, F1 {_percent(scores.occupied_f1)} (within one cell)"),
             ("free", f"{_percent(scores.free_accuracy)} right"),
             ("AUC", "-" if scores.auc is None else f"{scores.auc:.4f}"),
         ]  # fmt: skip

@@ -44,12 +44,17 @@ class ViewerOptions:
 
 @dataclass(frozen=True)
 class Scene:
-    """What is known before the first scan: the log's name, the mapper, the map's bounds (m), the true world."""
+    """What is known before the first scan.
+
+    The log's name, the mapper, the map's bounds (m), the true world where the log has it, and whether the
+    poses are held against true ones.
+    """
 
     log: str
     mapper: str
     bounds: Bounds
     world: World | None
+    has_pose_errors: bool
 
 
 class Viewer(Protocol):

@@ -31,7 +31,7 @@ class Truth:
         except (ValueError, TypeError, AttributeError) as error:
             raise LogReadError(log.path, f"its world.json does not describe a world: {error}") from error
         topic = log.topics.get(TRUE_PRIMITIVES_TOPIC)
-        if topic is None or topic.type != MARKERS_TYPE or not topic.count:
+        if topic is None or topic.type != MARKERS_TYPE or not topic.messages:
             return cls(world, [])
         moved = [
             (stamp, replace(world, primitives=primitives))

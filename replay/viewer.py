@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import math
 import os
+import socket
 import time
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
-from urllib.parse import quote
+from urllib.parse import quote, urlsplit
 
 import numpy as np
 import rerun as rr
@@ -34,14 +35,19 @@ BATCH_SECONDS = 0.1
 """Scans are sent in batches, no larger and no older than this; a batch costs little more than one scan."""
 
 TRAIL_POINTS = 2000
-SCAN_Z, TRAIL_Z, TRUTH_Z = 0.02, 0.01, 0.03
-"""Heights (m) that keep what is drawn on the map from flickering through it."""
+TRAIL_LIFT, SCAN_LIFT, TRUTH_LIFT = 0.0004, 0.0008, 0.0012
+"""Heights above the map, as shares of its size: enough to keep what is drawn on it from flickering."""
 
 WEB_PORT = 9090
 """Where ``--serve`` serves the viewer itself."""
 
+CONNECT_SECONDS = 3.0
+"""How long a viewer may take to answer."""
+
 FIELD_OF_VIEW = math.radians(55)
 """The viewer's vertical field of view."""
+
+Color = tuple[int, int, int]
 
 SCAN_COLOR = (255, 80, 60)
 TRAIL_COLOR = (40, 110, 220)
@@ -49,24 +55,31 @@ LASER_COLOR = (40, 110, 220)
 TRUTH_COLOR = (150, 150, 150)
 
 SCORES = {
-    "occupied_f1": "occupied F1",
-    "occupied_precision": "occupied precision",
-    "occupied_recall": "occupied recall",
-    "free_accuracy": "free accuracy",
-    "auc": "AUC",
+    "occupied_f1": ("occupied F1", (255, 255, 255)),
+    "occupied_precision": ("occupied precision", (86, 180, 233)),
+    "occupied_recall": ("occupied recall", (230, 159, 0)),
+    "free_accuracy": ("free accuracy", (0, 158, 115)),
+    "auc": ("AUC", (204, 121, 167)),
 }
+"""The map's scores over time: name and colour of each line."""
 
 
 class RerunViewer:
-    """Draws a replay as a rerun recording. Raises OutputError or ConnectionFailed where it cannot be sent."""
+    """Draws a replay as a rerun recording, which is opened when the replay begins.
 
-    def __init__(self, options: ViewerOptions) -> None:
+    ``announce`` is told where a served replay can be looked at. Raises UsageError, OutputError or
+    ViewerUnreachableError where the recording cannot be sent.
+    """
+
+    def __init__(self, options: ViewerOptions, announce: Callable[[str], None]) -> None:
+        if options.spawn:
+            _check_display()
+        if options.connect is not None:
+            _check_answers(options.connect)
         self._options = options
+        self._announce = announce
         self._recording = rr.RecordingStream(APPLICATION)
         self._recording.set_log_time_enabled(False)
-        self.url: str | None = None
-        self.web_url: str | None = None
-        self._open_sinks()
         self._batch: list[_ScanEntry] = []
         self._batch_started = 0.0
         self._pose_errors: list[tuple[int, int, float, float]] = []
@@ -75,16 +88,17 @@ class RerunViewer:
         self._styled: set[str] = set()
 
     def begin(self, scene: Scene) -> None:
-        """Sends the layout, the names and colours of the series, and the true world."""
+        """Opens the recording; sends the layout, the names and colours of the series, and the true world."""
+        self._open_sinks()
         x0, y0, x1, y1 = scene.bounds
         self._size = max(x1 - x0, y1 - y0)
         self._recording.send_recording_name(f"{scene.log} ({scene.mapper})")
         self._recording.send_blueprint(_blueprint(scene))
         self._static("map", rr.ViewCoordinates.RIGHT_HAND_Z_UP)
         self._name_series("scores", SCORES.values())
-        self._name_series("pose_error/position", ["position, mm"])
-        self._name_series("pose_error/heading", ["heading, degrees"])
-        self._name_series("timing", ["mapping, ms a scan"])
+        self._name_series("pose_error/position", [("position, mm", (86, 180, 233))])
+        self._name_series("pose_error/heading", [("heading, degrees", (230, 159, 0))])
+        self._name_series("timing", [("mapping, ms a scan", (86, 180, 233))])
         if scene.world is not None:
             self._send_truth(scene.world)
 
@@ -103,11 +117,10 @@ class RerunViewer:
         self._send_batch()
         self._at(position, stamp)
         self._recording.log("map/grid", _grid_map(grid))
-        trail = np.asarray(_thin(self._trail, TRAIL_POINTS))
-        if len(trail):
-            strip = np.column_stack((trail, np.full(len(trail), TRAIL_Z)))
-            radius = rr.Radius.ui_points(0.75)
-            self._recording.log("map/trajectory", rr.LineStrips3D([strip], colors=[TRAIL_COLOR], radii=radius))
+        if self._trail:
+            trail = self._lifted(np.asarray(_thin(self._trail, TRAIL_POINTS)), TRAIL_LIFT)
+            dots = rr.Points3D(trail, colors=[TRAIL_COLOR], radii=rr.Radius.ui_points(1.75))
+            self._recording.log("map/trajectory", dots)
         if scores is not None:
             values = [value if (value := getattr(scores, name)) is not None else math.nan for name in SCORES]
             self._recording.log("scores", rr.Scalars(values))
@@ -138,15 +151,15 @@ class RerunViewer:
         if options.save is not None:
             sinks.append(_file_sink(options.save))
         if options.spawn:
-            _check_display()
             rr.spawn(connect=False)
             sinks.append(rr.GrpcSink())
         if options.connect is not None:
-            sinks.append(_grpc_sink(options.connect))
+            sinks.append(rr.GrpcSink(options.connect))
         if options.serve:
-            self.url = self._recording.serve_grpc()
-            rr.serve_web_viewer(web_port=WEB_PORT, open_browser=False, connect_to=self.url)
-            self.web_url = f"http://localhost:{WEB_PORT}/?url={quote(self.url, safe='')}"
+            url = self._recording.serve_grpc()
+            rr.serve_web_viewer(web_port=WEB_PORT, open_browser=False, connect_to=url)
+            page = f"http://localhost:{WEB_PORT}/?url={quote(url, safe='')}"
+            self._announce(f"serving; in a browser: {page}   or: rerun {url}")
         elif sinks:
             self._recording.set_sinks(*sinks)
 
@@ -157,23 +170,27 @@ class RerunViewer:
     def _static(self, path: str, what: Any) -> None:
         self._recording.log(path, what, static=True)
 
-    def _name_series(self, path: str, names: Iterable[str]) -> None:
-        self._static(path, rr.SeriesLines(names=list(names)))
+    def _name_series(self, path: str, series: Iterable[tuple[str, Color]]) -> None:
+        names, colors = zip(*series, strict=True)
+        self._static(path, rr.SeriesLines(names=names, colors=colors))
+
+    def _lifted(self, points: FloatArray, lift: float) -> FloatArray:
+        """Points (..., 2) of the map at a height above it."""
+        height = np.full((*points.shape[:-1], 1), lift * self._size)
+        return np.concatenate((points, height), axis=-1)
 
     def _send_truth(self, world: World) -> None:
-        outlines = [_closed(primitive.outline(64)) for primitive in world.primitives]
+        rings = [np.vstack((ring := primitive.outline(64), ring[:1])) for primitive in world.primitives]
+        outlines = [self._lifted(ring, TRUTH_LIFT) for ring in rings]
         labels = [str(primitive.kind) for primitive in world.primitives]
         radius = rr.Radius.ui_points(1.0)
         if outlines:
             self._static(
                 "map/truth/primitives",
-                rr.LineStrips3D(
-                    outlines, labels=labels, show_labels=False, colors=[TRUTH_COLOR], radii=radius
-                ),
+                rr.LineStrips3D(outlines, labels=labels, show_labels=False, colors=[TRUTH_COLOR], radii=radius),
             )
         if world.walls:
-            ends = np.asarray(world.walls).reshape(-1, 2, 2)
-            strips = np.concatenate((ends, np.full((*ends.shape[:2], 1), TRUTH_Z)), axis=2)
+            strips = list(self._lifted(np.asarray(world.walls).reshape(-1, 2, 2), TRUTH_LIFT))
             self._static("map/truth/walls", rr.LineStrips3D(strips, colors=[TRUTH_COLOR], radii=radius))
 
     def _send_batch(self) -> None:
@@ -195,8 +212,7 @@ class RerunViewer:
 
     def _send_scans(self, index: Sequence[Any], entries: list[_ScanEntry]) -> None:
         counts = [len(entry.points) for entry in entries]
-        flat = np.concatenate([entry.points for entry in entries])
-        points = np.column_stack((flat, np.full(len(flat), SCAN_Z))).astype(np.float32)
+        points = self._lifted(np.concatenate([entry.points for entry in entries]), SCAN_LIFT)
         columns = rr.Points3D.columns(positions=points).partition(counts)
         self._columns("map/scan", index, columns)
         self._static_once("map/scan", rr.Points3D.from_fields(colors=[SCAN_COLOR], radii=rr.Radius.ui_points(1.75)))
@@ -204,12 +220,10 @@ class RerunViewer:
     def _send_lasers(self, index: Sequence[Any], entries: list[_ScanEntry]) -> None:
         poses = [entry.pose for entry in entries]
         length = 0.06 * min(self._size, 10.0)
-        origins = [(pose.x, pose.y, TRUTH_Z) for pose in poses]
+        origins = self._lifted(np.array([(pose.x, pose.y) for pose in poses]), TRUTH_LIFT)
         vectors = [(length * math.cos(pose.theta), length * math.sin(pose.theta), 0.0) for pose in poses]
         self._columns("map/laser", index, rr.Arrows3D.columns(vectors=vectors, origins=origins))
-        self._static_once(
-            "map/laser", rr.Arrows3D.from_fields(colors=[LASER_COLOR], radii=rr.Radius.ui_points(2.5))
-        )
+        self._static_once("map/laser", rr.Arrows3D.from_fields(colors=[LASER_COLOR], radii=rr.Radius.ui_points(2.5)))
 
     def _static_once(self, path: str, what: Any) -> None:
         """Looks that stay the same are sent once."""
@@ -228,10 +242,6 @@ class _ScanEntry:
     pose: Pose2D
     points: FloatArray
     seconds: float
-
-
-class ConnectionFailed(PrimError):
-    """A viewer that does not answer."""
 
 
 def _blueprint(scene: Scene) -> rrb.Blueprint:
@@ -255,18 +265,22 @@ def _blueprint(scene: Scene) -> rrb.Blueprint:
     right: list[Any] = [rrb.TextDocumentView(origin="summary", name="Result")]
     if scene.world is not None:
         unit = rrb.ScalarAxis(range=(0.0, 1.02), zoom_lock=True)
-        right.append(rrb.TimeSeriesView(origin="scores", name="Map accuracy", axis_y=unit))
-        errors = rrb.TimeSeriesView(origin="pose_error", name="Pose error")
-        right.append(rrb.Tabs(errors, rrb.TimeSeriesView(origin="timing", name="Stage timings"), active_tab=0))
-    else:
-        right.append(rrb.TimeSeriesView(origin="timing", name="Stage timings"))
-    right.append(rrb.TextLogView(origin="events", name="Events"))
+        right.append(_series("scores", "Map accuracy", axis_y=unit))
+    if scene.has_pose_errors:
+        right.append(_series("pose_error", "Pose error"))
+    right += [_series("timing", "Stage timings"), rrb.TextLogView(origin="events", name="Events")]
+    shares = [2.0, *[2.0] * (len(right) - 2), 1.2]
     return rrb.Blueprint(
-        rrb.Horizontal(map_view, rrb.Vertical(*right), column_shares=[3, 2]),
+        rrb.Horizontal(map_view, rrb.Vertical(*right, row_shares=shares), column_shares=[3, 2]),
         rrb.TimePanel(timeline=STAMP, state="collapsed"),
         rrb.BlueprintPanel(state="collapsed"),
         rrb.SelectionPanel(state="collapsed"),
     )
+
+
+def _series(origin: str, name: str, **properties: Any) -> rrb.TimeSeriesView:
+    legend = rrb.PlotLegend(rrb.Corner2D.RightBottom)
+    return rrb.TimeSeriesView(origin=origin, name=name, plot_legend=legend, **properties)
 
 
 def _grid_map(grid: OccupancyGrid) -> rr.GridMap:
@@ -294,11 +308,6 @@ def _index(times: Sequence[tuple[int, int]]) -> list[Any]:
     ]
 
 
-def _closed(outline: FloatArray) -> FloatArray:
-    ring = np.vstack((outline, outline[:1]))
-    return np.column_stack((ring, np.full(len(ring), TRUTH_Z)))
-
-
 def _thin(points: Sequence[tuple[float, float]], most: int) -> Sequence[tuple[float, float]]:
     """At most about ``most`` of the points, evenly spread, the last one among them."""
     step = max(1, -(-len(points) // most))
@@ -313,14 +322,25 @@ def _file_sink(path: Path) -> Any:
     return rr.FileSink(path)
 
 
-def _grpc_sink(url: str) -> Any:
+class ViewerUnreachableError(PrimError):
+    """No viewer where one should be."""
+
+
+def _check_answers(url: str) -> None:
+    """Raises unless something listens at ``url``: rerun itself would wait, lose everything, and say nothing."""
     try:
-        return rr.GrpcSink(url)
-    except Exception as error:
-        raise UsageError(f"--connect {url}: not an address of a viewer: {error}") from error
+        parts = urlsplit(url)
+        host, port = parts.hostname, parts.port
+    except ValueError:
+        parts, host, port = urlsplit(""), None, None
+    if not parts.scheme.startswith("rerun") or host is None or port is None:
+        raise UsageError(f"--connect {url}: give an address such as rerun+http://127.0.0.1:9876/proxy")
+    try:
+        socket.create_connection((host, port), timeout=CONNECT_SECONDS).close()
+    except OSError as error:
+        raise ViewerUnreachableError(f"no viewer answers at {url}: {error}; start one there with: rerun") from error
 
 
 def _check_display() -> None:
     if os.name == "posix" and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
         raise UsageError("--spawn needs a display, and there is none: save with --save OUT.rrd, or --serve")
-

@@ -1,0 +1,52 @@
+# `make demo` and `make test` do all their own set-up on a machine with Python 3.11+ and make.
+
+PYTHON ?= python3
+BIN := .venv/bin
+SEED ?= 7
+NOISE_STD ?= 0.05
+
+export PIP_DISABLE_PIP_VERSION_CHECK := 1
+
+.PHONY: demo test test-slow bench-maps lint format clean
+
+demo: .venv/installed
+	@mkdir -p demo
+	$(BIN)/prim-record demo/session.mcap --seed $(SEED) --noise-std $(NOISE_STD)
+	cd demo && ../$(BIN)/prim-replay session.mcap --mapper det --quiet && ../$(BIN)/prim-replay session.mcap --mapper prob
+	@$(BIN)/python docs/screenshot.py demo/session.prob.rrd demo/session.prob.png; case $$? in \
+	  0) echo "picture: demo/session.prob.png" ;; \
+	  4) echo "no picture: this machine cannot render (apt-get install mesa-vulkan-drivers)" ;; \
+	  *) exit 1 ;; esac
+
+test: lint
+	$(BIN)/python -m pytest -q
+
+test-slow: .venv/installed-dev
+	$(BIN)/python -m pytest -q -m slow
+
+bench-maps: .venv/installed
+	$(BIN)/python bench/maps.py --update README.md
+
+lint: .venv/installed-dev
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+
+format: .venv/installed-dev
+	$(BIN)/ruff check --fix .
+	$(BIN)/ruff format .
+
+.venv/bin/python:
+	$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "prim needs Python 3.11 or newer")'
+	$(PYTHON) -m venv .venv
+
+.venv/installed: .venv/bin/python pyproject.toml constraints.txt
+	$(BIN)/python -m pip install -q -c constraints.txt -e .
+	@touch $@
+
+.venv/installed-dev: .venv/installed
+	$(BIN)/python -m pip install -q -c constraints.txt -e '.[dev]'
+	@touch $@
+
+clean:
+	rm -rf .venv demo build *.egg-info

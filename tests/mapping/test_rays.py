@@ -1,0 +1,119 @@
+"""The compiled kernels against textbook loops."""
+
+import math
+from fractions import Fraction
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from mapping.deterministic import DeterministicMapper
+from mapping.grid import GridFrame, cell_of
+from mapping.rays import FREE, OCCUPIED, UNSEEN, mark
+from prim.frames import Pose2D, Scan
+
+
+def bresenham(row: int, col: int, end_row: int, end_col: int) -> list[tuple[int, int]]:
+    """Cells from start to end, the textbook's way: whole numbers and an error that is carried along."""
+    d_row, d_col = abs(end_row - row), abs(end_col - col)
+    step_row, step_col = (1 if end_row >= row else -1), (1 if end_col >= col else -1)
+    steep = d_row > d_col
+    major, minor = (d_row, d_col) if steep else (d_col, d_row)
+    cells = [(row, col)]
+    error = 2 * minor - major
+    for _ in range(major):
+        side = error >= 0
+        error += 2 * minor - 2 * major * side
+        row += step_row if steep else step_row * side
+        col += step_col * side if steep else step_col
+        cells.append((row, col))
+    return cells
+
+
+def mark_line(end_row: int, end_col: int, hit: bool, rows: int, cols: int, row: int, col: int) -> np.ndarray:
+    """One ray from the centre of cell (row, col) to that of (end_row, end_col), in cells of 1 m."""
+    states = np.full((rows, cols), UNSEEN, np.uint8)
+    dx, dy = end_col - col, end_row - row
+    z = math.hypot(dx, dy)
+    direction = np.array([[dx / z, dy / z]]) if z else np.array([[1.0, 0.0]])
+    limits = (0.0, 2 * z + 1) if hit else (0.0, z)
+    ranges = np.array([max(z, 0.25)], dtype=np.float64)
+    mark(states, 0, 0, ranges, direction, (col + 0.5, row + 0.5, 1.0, 0.0), limits, 1.0)
+    return states
+
+
+CELLS = st.integers(-40, 60)
+
+
+@given(CELLS, CELLS, CELLS, CELLS, st.booleans())
+def test_lines_are_bresenhams_and_clipping_moves_no_cell(
+    row: int, col: int, end_row: int, end_col: int, hit: bool
+) -> None:
+    if (row, col) == (end_row, end_col):
+        return
+    rows, cols = 20, 30
+    expected = np.full((rows, cols), UNSEEN, np.uint8)
+    line = bresenham(row, col, end_row, end_col)
+    for r, c in line[:-1] if hit else line:
+        if 0 <= r < rows and 0 <= c < cols:
+            expected[r, c] = FREE
+    if hit and 0 <= end_row < rows and 0 <= end_col < cols:
+        expected[end_row, end_col] = OCCUPIED
+    assert (mark_line(end_row, end_col, hit, rows, cols, row, col) == expected).all()
+
+
+@given(st.integers(0, 3000), st.integers(0, 3000))
+def test_long_lines_are_exact(end_row: int, end_col: int) -> None:
+    if max(end_row, end_col) == 0:
+        return
+    states = mark_line(end_row, end_col, False, 3001, 3001, 0, 0)
+    rows, cols = np.array(bresenham(0, 0, end_row, end_col)).T
+    assert np.count_nonzero(states == FREE) == len(rows)
+    assert (states[rows, cols] == FREE).all()
+
+
+@given(st.integers(1, 700_000), st.data())
+def test_fixed_point_offsets_are_exact(steps: int, data: st.DataObject) -> None:
+    """floor(k m / n + 1/2) in rational numbers against the kernel's arithmetic, up to its stated limit."""
+    from mapping.rays import HALF, SHIFT
+
+    minor, step = data.draw(st.integers(0, steps)), data.draw(st.integers(0, steps))
+    slope = ((minor << SHIFT) + steps - 1) // steps
+    exact = math.floor(Fraction(step * minor, steps) + Fraction(1, 2))
+    assert (step * slope + HALF) >> SHIFT == exact
+
+
+def test_a_ray_never_frees_the_cell_that_it_hits_nor_one_that_another_hits() -> None:
+    rng = np.random.default_rng(0)
+    mapper = DeterministicMapper(0.1, (-3, -3, 3, 3))
+    scan = Scan(0, "laser", 0.0, 2 * math.pi / 400, 0.01, 9.0, rng.uniform(0.3, 2.8, 400).astype(np.float32))
+    pose = Pose2D(0.03, -0.04, 0.3)
+    mapper.update(scan, pose)
+    grid = mapper.grid()
+    for x, y in scan.points(pose):
+        row, col = cell_of(y, 0.1) - grid.frame.row, cell_of(x, 0.1) - grid.frame.col
+        assert grid.probability[row, col] == 1
+
+
+@pytest.mark.parametrize(
+    ("coordinate", "resolution", "cell"),
+    [
+        (0.3, 0.1, 3),
+        (0.29999, 0.1, 2),
+        (-0.3, 0.1, -3),
+        (0.0, 0.1, 0),
+        (1.0, 0.01, 100),
+        (0.07, 0.01, 7),
+        (-1e-12, 0.1, 0),
+    ],
+)
+def test_a_border_belongs_to_the_cell_above(coordinate: float, resolution: float, cell: int) -> None:
+    assert cell_of(coordinate, resolution) == cell
+
+
+def test_frames_cover_their_bounds_exactly() -> None:
+    frame = GridFrame.covering((-1.1, -0.3, 1.1, 0.7), 0.1)
+    assert (frame.cols, frame.rows) == (22, 10)
+    assert frame.bounds == pytest.approx((-1.1, -0.3, 1.1, 0.7))
+    assert GridFrame.covering(frame.bounds, 0.1) == frame

@@ -1,0 +1,244 @@
+import json
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+import shapely
+
+from prim import console
+from prim.errors import UsageError, WorldError
+from prim.frames import Pose2D
+from prim.log import LogReader
+from prim.messages import (
+    POSE_TYPE,
+    SCAN_TOPIC,
+    TRUE_POSE_TOPIC,
+    decode_message,
+    decode_poses,
+    decode_scan,
+    planar,
+)
+from prim.shapes import Kind, Primitive
+from prim.world import World
+from recorder.cli import app
+from recorder.sensors import Compass, Gps, Lidar
+from recorder.session import Session, SessionOptions, record
+from recorder.simulator import ROBOT_RADIUS, Simulator
+from recorder.world import WorldOptions, draw_world
+
+
+def prim_record(*arguments: object) -> int:
+    return console.run(app, "prim-record", [str(argument) for argument in arguments])
+
+
+def test_the_same_options_write_the_same_bytes(tmp_path: Path) -> None:
+    options = SessionOptions(seed=4, stops=(3, 3))
+    first, second = (record(tmp_path / name, options).path.read_bytes() for name in ("a.mcap", "b.mcap"))
+    assert first == second
+    assert record(tmp_path / "c.mcap", SessionOptions(seed=5, stops=(3, 3))).path.read_bytes() != first
+
+
+def test_more_noise_changes_neither_world_nor_poses(tmp_path: Path) -> None:
+    def seen(noise: float) -> tuple[World, list[Pose2D], np.ndarray]:
+        session = record(tmp_path / "a.mcap", SessionOptions(seed=4, stops=(3, 3), lidar=Lidar(noise_std=noise)))
+        with LogReader(session.path) as log:
+            poses = [
+                planar(p)
+                for _, (p,) in log.decoded(log.topics[TRUE_POSE_TOPIC], lambda d: decode_poses(POSE_TYPE, d))
+            ]
+            ranges = np.array([scan.ranges for _, scan in log.decoded(log.topics[SCAN_TOPIC], decode_scan)])
+        return session.world, poses, ranges
+
+    quiet, loud = seen(0.0), seen(0.1)
+    assert quiet[:2] == loud[:2]
+    twice = seen(0.2)[2]
+    finite = np.isfinite(twice) & np.isfinite(loud[2])
+    assert (twice - quiet[2])[finite] == pytest.approx(2 * (loud[2] - quiet[2])[finite], abs=1e-5)
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_worlds_are_as_the_paper_draws_them(seed: int) -> None:
+    world = draw_world(np.random.default_rng(seed), WorldOptions())
+    outlines = [shapely.Polygon(primitive.outline()) for primitive in world.primitives]
+    assert all(not a.intersects(b) for i, a in enumerate(outlines) for b in outlines[:i])
+    assert all(shapely.box(-1, -1, 1, 1).contains(outline) for outline in outlines)
+    for kind in Kind:
+        assert sum(primitive.kind is kind for primitive in world.primitives) <= 2
+    assert len(world.walls) == 4
+
+
+def test_sizes_fill_the_papers_ranges() -> None:
+    """III-B in millimetres: smallest and largest of many drawn are near the ends of their ranges."""
+    rng = np.random.default_rng(0)
+    ranges = {
+        Kind.SQUARE: [(0.08, 0.30)],
+        Kind.RECTANGLE: [(0.06, 0.32)] * 2,
+        Kind.CIRCLE: [(0.05, 0.30)],
+        Kind.ELLIPSE: [(0.02, 0.16)] * 2,
+    }
+    for kind, limits in ranges.items():
+        worlds = [
+            draw_world(rng, WorldOptions((3, 3), kinds=(kind,), per_kind=(4, 4), walls=False)) for _ in range(60)
+        ]
+        sizes = np.array([primitive.size for world in worlds for primitive in world.primitives])
+        low, high = min(limit[0] for limit in limits), max(limit[1] for limit in limits)
+        assert low <= sizes.min() < low + 0.1 * (high - low)
+        assert high - 0.1 * (high - low) < sizes.max() <= high
+    worlds = [draw_world(rng, WorldOptions(kinds=(Kind.TRIANGLE,), per_kind=(2, 2))) for _ in range(60)]
+    base, height = np.array([primitive.size for world in worlds for primitive in world.primitives]).T
+    leg = np.hypot(base / 2, height)
+    assert base.min() >= 0.1 and base.max() <= 0.3
+    assert leg.min() >= 0.1 - 1e-9 and leg.max() <= 0.3 + 1e-9
+    assert height.min() >= 0.06
+
+
+def test_worlds_that_cannot_be(tmp_path: Path) -> None:
+    with pytest.raises(UsageError, match="do not fit"):
+        draw_world(np.random.default_rng(0), WorldOptions((0.5, 0.5), per_kind=(9, 9)))
+
+
+def test_the_robot_keeps_clear_of_everything(quiet_session: Session) -> None:
+    outlines = [shapely.Polygon(primitive.outline()) for primitive in quiet_session.world.primitives]
+    with LogReader(quiet_session.path) as log:
+        topic = log.topics[TRUE_POSE_TOPIC]
+        poses = [planar(pose) for _, (pose,) in log.decoded(topic, lambda d: decode_poses(POSE_TYPE, d))]
+    assert len(poses) == quiet_session.scans
+    assert len(poses) + quiet_session.skipped == 100
+    stops = {(round(10 * pose.x + 9.5) / 2, round(10 * pose.y + 9.5) / 2) for pose in poses}
+    assert len(stops) == len(poses)
+    for pose in poses:
+        assert all(outline.distance(shapely.Point(pose.x, pose.y)) > ROBOT_RADIUS for outline in outlines)
+
+
+def test_stops_inside_a_primitive_or_touching_it_are_skipped() -> None:
+    circle = Primitive(Kind.CIRCLE, 0.0, 0.0, None, (0.1,))
+    simulator = Simulator(World((2.0, 2.0), (circle,)).walled())
+    assert not simulator.warp(Pose2D(0.0, 0.0))
+    assert not simulator.warp(Pose2D(0.1 + ROBOT_RADIUS - 1e-3, 0.0))
+    assert simulator.warp(Pose2D(0.1 + ROBOT_RADIUS + 1e-3, 0.0))
+    assert not simulator.warp(Pose2D(0.98, 0.0))
+
+
+def test_exact_ranges_are_those_of_the_world(quiet_session: Session) -> None:
+    with LogReader(quiet_session.path) as log:
+        _, scan = next(log.decoded(log.topics[SCAN_TOPIC], decode_scan))
+        topic = log.topics[TRUE_POSE_TOPIC]
+        _, (stamped,) = next(log.decoded(topic, lambda d: decode_poses(POSE_TYPE, d)))
+    pose = planar(stamped)
+    bearings = np.linspace(-3.14, 3.14, 500) + pose.theta
+    exact = quiet_session.world.cast((pose.x, pose.y), np.column_stack((np.cos(bearings), np.sin(bearings))))
+    assert scan.ranges == pytest.approx(exact, abs=2e-6)
+    assert (scan.range_min, scan.range_max) == pytest.approx((0.032, 5.0))
+
+
+def test_ranges_beyond_the_limits_follow_rep_117() -> None:
+    """In the open, with a circle near: noise of 0.5 m pushes some beams below range_min."""
+    world = World((2.0, 2.0), (Primitive(Kind.CIRCLE, 0.5, 0.0, None, (0.3,)),))
+    scan = Lidar(noise_std=0.5).measure(world, Pose2D(), 0, 0.1, np.random.default_rng(0))
+    exact = Lidar().exact(world, Pose2D())
+    assert np.isposinf(scan.ranges[np.isinf(exact)]).all()
+    assert np.isneginf(scan.ranges).any()
+    finite = scan.ranges[np.isfinite(scan.ranges)]
+    assert finite.min() >= np.float32(0.032) and finite.max() <= 5.0
+
+
+@pytest.mark.parametrize(("noise", "std"), [(0.0, 0.0), (0.05, 0.05), (0.25, 0.25)])
+def test_noise_has_its_standard_deviation(noise: float, std: float) -> None:
+    world = World((4.0, 4.0)).walled()
+    lidar = Lidar(rays=20_000, noise_std=noise)
+    scan = lidar.measure(world, Pose2D(), 0, 0.1, np.random.default_rng(1))
+    errors = scan.ranges - lidar.exact(world, Pose2D())
+    assert errors.std() == pytest.approx(std, rel=0.03, abs=1e-6)
+    assert errors.mean() == pytest.approx(0, abs=max(std, 1e-4) * 0.03)
+
+
+def test_gps_and_compass_noise() -> None:
+    rng = np.random.default_rng(0)
+    fixes = np.array([Gps(0.1).measure(Pose2D(1, 2, 0), rng) for _ in range(4000)])
+    assert fixes.mean(axis=0) == pytest.approx([1, 2], abs=0.01)
+    assert fixes.std(axis=0) == pytest.approx([0.1, 0.1], rel=0.05)
+    headings = [Compass(0.05).measure(Pose2D(0, 0, 1), rng) for _ in range(4000)]
+    assert np.std(headings) == pytest.approx(0.05, rel=0.05)
+
+
+def test_the_log_describes_itself(quiet_session: Session) -> None:
+    with LogReader(quiet_session.path) as log:
+        described = log.metadata["prim"]
+        world = log.attachment("world.json")
+        markers = next(iter(log.messages("/ground_truth/primitives"))).data
+    assert json.loads(described["seed"]) == 11
+    assert json.loads(described["lidar"])["noise_std"] == 0.0
+    assert World.from_json(json.loads(world or b"")) == quiet_session.world
+    texts = [
+        json.loads(marker.text) for marker in decode_message("visualization_msgs/msg/MarkerArray", markers).markers
+    ]
+    assert sorted(text["kind"] for text in texts if "kind" in text) == sorted(Kind)
+
+
+def test_a_world_from_a_file(tmp_path: Path) -> None:
+    world = World((3.0, 2.0), (Primitive(Kind.SQUARE, 1.0, 0.5, 0.3, (0.2,)),)).walled()
+    path = tmp_path / "world.json"
+    path.write_text(json.dumps(world.to_json()))
+    assert prim_record(tmp_path / "a.mcap", "--world", path, "--quiet") == 0
+    with LogReader(tmp_path / "a.mcap") as log:
+        assert World.from_json(json.loads(log.attachment("world.json") or b"")) == world
+    with pytest.raises(WorldError):
+        record(tmp_path / "b.mcap", SessionOptions(world_file=tmp_path / "none.json"))
+
+
+def test_options_of_the_command_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = tmp_path / "a.mcap"
+    code = prim_record(
+        *(path, "--seed", 1, "--kinds", "circle,ellipse", "--per-kind", 2, "--no-walls", "--rays", 90, "--fov", 180),
+        *("--range-max", 3, "--noise", 0.05, "--gps-noise", 0.2, "--compass-noise", 5, "--stops", 2, 3, "--rate", 5),
+        *("--size", 3, 4, "--motion", "warp"),
+    )
+    assert code == 0
+    assert "noise 250 mm, 2 circles, 2 ellipses" in capsys.readouterr().out
+    with LogReader(path) as log:
+        scans = [scan for _, scan in log.decoded(log.topics[SCAN_TOPIC], decode_scan)]
+        described = log.metadata["prim"]
+        world = World.from_json(json.loads(log.attachment("world.json") or b""))
+    assert (world.size, world.walls) == ((3, 4), ())
+    assert len(scans[0].ranges) == 90
+    assert scans[0].angle_min == pytest.approx(-math.pi / 2)
+    assert scans[1].stamp - scans[0].stamp == 200_000_000
+    assert json.loads(described["lidar"])["noise_std"] == 0.25
+    assert json.loads(described["compass"])["noise_std"] == pytest.approx(math.radians(5))
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (["--noise", "0.05", "--noise-std", "0.05"], "give one of them"),
+        (["--noise-std", "-1"], "must not be below 0"),
+        (["--noise-std", "nan"], "must not be below 0"),
+        (["--kinds", "pentagon"], "pentagon"),
+        (["--per-kind", "3-1"], "from small to large"),
+        (["--per-kind", "many"], "neither a number"),
+        (["--per-kind", "40"], "do not fit"),
+        (["--rays", "0"], "--rays"),
+        (["--range-min", "6"], "not below"),
+        (["--fov", "400"], "full turn"),
+        (["--rate", "0"], "above 0"),
+        (["--stops", "0", "5"], "above 0"),
+        (["--motion", "fly"], "--motion"),
+        (["--nonsense"], "--nonsense"),
+    ],
+)
+def test_impossible_options(
+    tmp_path: Path, arguments: list[str], said: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert prim_record(tmp_path / "a.mcap", *arguments) == 2
+    error = capsys.readouterr().err
+    assert said in error
+    assert error.startswith("prim-record: error: ")
+    assert error.count("\n") == 1
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_unwritable_output(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert prim_record(tmp_path / "no" / "a.mcap") == 1
+    assert prim_record(tmp_path) == 1
+    assert capsys.readouterr().err.count("\n") == 2

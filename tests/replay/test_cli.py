@@ -1,0 +1,276 @@
+"""prim-replay as users run it: outputs, exit codes, one line per error."""
+
+import json
+import math
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from prim import console
+from recorder.session import Session
+from replay.cli import app, join_bounds
+
+Run = Callable[..., tuple[int, str, str]]
+
+
+@pytest.fixture
+def replay(in_tmp: Path, capsys: pytest.CaptureFixture[str]) -> Run:
+    """Runs prim-replay in an empty folder: exit code, stdout, stderr."""
+
+    def run(*arguments: object) -> tuple[int, str, str]:
+        code = console.run(app, "prim-replay", join_bounds([str(argument) for argument in arguments]))
+        seen = capsys.readouterr()
+        return code, seen.out, seen.err
+
+    return run
+
+
+def report_of(path: str) -> dict[str, Any]:
+    parsed: dict[str, Any] = json.loads(Path(path).read_text())
+    return parsed
+
+
+@pytest.mark.parametrize("mapper", ["det", "prob"])
+def test_a_plain_replay_leaves_a_recording_and_a_report(replay: Run, noisy_session: Session, mapper: str) -> None:
+    code, out, err = replay(noisy_session.path, "--mapper", mapper)
+    assert (code, err) == (0, "")
+    assert {path.name for path in Path().iterdir()} == {f"noisy.{mapper}.rrd", f"noisy.{mapper}.report.json"}
+    assert out.splitlines()[-1] == f"look:  rerun noisy.{mapper}.rrd"
+    report = report_of(f"noisy.{mapper}.report.json")
+    assert report["schema"] == "prim-replay/1"
+    assert report["log"] == {
+        "path": str(noisy_session.path),
+        "duration_s": pytest.approx(noisy_session.duration),
+        "scans": noisy_session.scans,
+        "scans_used": noisy_session.scans,
+        "rays": noisy_session.scans * 180,
+        "messages_lost": 0,
+        "recovered": False,
+    }
+    assert report["pose"] == {"source": "truth", "rmse_m": None, "rmse_rad": None}
+    assert report["map"]["mapper"] == mapper
+    assert report["map"]["origin_m"] == pytest.approx([-1.1, -1.1])
+    assert report["map"]["cells"] == [220, 220]
+    assert report["map"]["noise_std_m"] is None
+    assert set(report["map"]["scores"]) == {
+        *("occupied_precision", "occupied_recall", "occupied_f1", "free_accuracy", "auc")
+    }
+    assert report["primitives"] == []
+    assert report["errors"] is None
+    assert set(report["timing"]) == {
+        *("read_s", "localize_s", "map_s", "detect_s", "refine_s", "viewer_s", "total_s"),
+        *("rays_per_s", "x_realtime"),
+    }
+
+
+def test_no_viewer_writes_no_recording_and_imports_no_rerun(noisy_session: Session, tmp_path: Path) -> None:
+    code = (
+        "import sys; from replay.cli import main; sys.argv[1:] = [sys.argv[1], '--no-viewer', '--quiet']\n"
+        "try: main()\nexcept SystemExit as stop: assert not stop.code, stop.code\n"
+        "bad = {'rerun', 'torch', 'ultralytics', 'matplotlib', 'shapely'} & set(sys.modules)\n"
+        "assert not bad, bad"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code, noisy_session.path], cwd=tmp_path, capture_output=True, check=False
+    )
+    assert (done.returncode, done.stdout, done.stderr) == (0, b"", b"")
+    assert [path.name for path in tmp_path.iterdir()] == ["noisy.prob.report.json"]
+
+
+def test_help_and_version_load_nothing_heavy() -> None:
+    code = (
+        "import sys; from {0}.cli import main; sys.argv[1:] = ['{1}']\n"
+        "try: main()\nexcept SystemExit as stop: assert not stop.code, stop.code\n"
+        "assert not {{'numpy', 'numba', 'rerun', 'mcap', 'pymunk'}} & set(sys.modules)"
+    )
+    for package in ("recorder", "replay"):
+        for option in ("--help", "--version"):
+            done = subprocess.run(
+                [sys.executable, "-c", code.format(package, option)], capture_output=True, text=True, check=False
+            )
+            assert (done.returncode, done.stderr) == (0, ""), done.stderr
+
+
+def test_all_outputs_can_be_named(replay: Run, noisy_session: Session) -> None:
+    code, out, _ = replay(
+        *(noisy_session.path, "--save", "a.rrd", "--report", "b.json", "--map", "c", "--trajectory", "d.tum")
+    )
+    assert code == 0
+    assert {path.name for path in Path().iterdir()} == {"a.rrd", "b.json", "c.pgm", "c.yaml", "d.tum"}
+    assert "a.rrd" in out
+    lines = [line.split() for line in Path("d.tum").read_text().splitlines()]
+    assert len(lines) == noisy_session.scans
+    assert all(len(line) == 8 for line in lines)
+    assert lines[0][0] == "1735689600.000000000"
+
+
+def test_the_nav2_map_reads_back_as_the_grid(replay: Run, noisy_session: Session) -> None:
+    """As nav2's map_server reads it: trinary, first image row at the top, the origin at the lower left."""
+    from replay.pipeline import Pipeline, ReplayOptions
+
+    assert replay(noisy_session.path, "--mapper", "det", "--map", "m", "--no-viewer")[0] == 0
+    yaml = dict(line.split(": ", 1) for line in Path("m.yaml").read_text().splitlines())
+    header, size, depth, pixels = Path(yaml["image"]).read_bytes().split(b"\n", 3)
+    assert (header, depth, yaml["mode"], yaml["negate"]) == (b"P5", b"255", "trinary", "0")
+    cols, rows = map(int, size.split())
+    occupancy = 1 - np.flipud(np.frombuffer(pixels, np.uint8).reshape(rows, cols)) / 255
+    cells = np.full(occupancy.shape, -1)
+    cells[occupancy > float(yaml["occupied_thresh"])] = 100
+    cells[occupancy < float(yaml["free_thresh"])] = 0
+    grid = Pipeline(noisy_session.path, ReplayOptions(mapper="det")).run().grid
+    assert (cells == np.select([grid.occupied, grid.free], [100, 0], -1)).all()
+    assert json.loads(yaml["origin"]) == pytest.approx([*grid.frame.origin, 0])
+    assert float(yaml["resolution"]) == grid.frame.resolution
+
+
+@pytest.mark.parametrize("pose", ["truth", "tf", "odom"])
+def test_all_pose_sources_of_a_warped_session_agree(replay: Run, noisy_session: Session, pose: str) -> None:
+    assert replay(noisy_session.path, "--pose", pose, "--no-viewer")[0] == 0
+    report = report_of("noisy.prob.report.json")
+    assert report["pose"]["source"] == pose
+    if pose != "truth":
+        assert report["pose"]["rmse_m"] == pytest.approx(0, abs=1e-9)
+        assert report["pose"]["rmse_rad"] == pytest.approx(0, abs=1e-9)
+
+
+def test_selections(replay: Run, noisy_session: Session) -> None:
+    scans = noisy_session.scans
+
+    def used(*options: object) -> int:
+        assert replay(noisy_session.path, "--no-viewer", "--quiet", *options) == (0, "", "")
+        log = report_of("noisy.prob.report.json")["log"]
+        assert log["scans"] == scans
+        return int(log["scans_used"])
+
+    assert used("--n-scans", 7) == 7
+    assert used("--stride", 3) == math.ceil(scans / 3)
+    assert used("--start", 0.95) == scans - 10
+    assert used("--end", 0.95) == 10
+    assert used("--start", 0.45, "--duration", 0.5) == 5
+    assert used("--start", 0.45, "--stride", 2, "--n-scans", 2) == 2
+
+
+def test_bounds_and_resolution(replay: Run, noisy_session: Session) -> None:
+    assert (
+        replay("--bounds", "-0.5", "-0.25", "1", "0.5", noisy_session.path, "--resolution", 0.05, "--no-viewer")[0]
+        == 0
+    )
+    frame = report_of("noisy.prob.report.json")["map"]
+    assert frame["cells"] == [15, 30]
+    assert frame["origin_m"] == pytest.approx([-0.5, -0.25])
+    assert replay(noisy_session.path, "--bounds", "auto", "--no-viewer")[0] == 0
+
+
+def test_a_laser_offset_moves_the_map(replay: Run, noisy_session: Session) -> None:
+    for name, options in (("a", []), ("b", ["--laser-offset", -0.1, 0.2, 90])):
+        replay(noisy_session.path, "--no-viewer", "--trajectory", f"{name}.tum", *options)
+    plain, moved = (np.loadtxt(f"{name}.tum") for name in "ab")
+    offset = np.hypot(*(moved - plain)[:, 1:3].T)
+    assert offset == pytest.approx(math.hypot(0.1, 0.2), abs=1e-6)
+    turn = 2 * np.arctan2(moved[:, 6], moved[:, 7]) - 2 * np.arctan2(plain[:, 6], plain[:, 7])
+    assert np.cos(turn) == pytest.approx(0, abs=1e-6)
+
+
+def test_rate_holds_the_replay(replay: Run, noisy_session: Session) -> None:
+    """Not a timing test: it may take longer, but it must not take less than asked for."""
+    assert replay(noisy_session.path, "--n-scans", 6, "--rate", 2, "--no-viewer")[0] == 0
+    assert report_of("noisy.prob.report.json")["timing"]["total_s"] >= 0.25
+
+
+def test_several_logs(replay: Run, noisy_session: Session, quiet_session: Session) -> None:
+    assert replay(noisy_session.path, quiet_session.path, "--mapper", "det", "--no-viewer")[0] == 0
+    assert {path.name for path in Path().iterdir()} == {"noisy.det.report.json", "quiet.det.report.json"}
+    code, _, err = replay(noisy_session.path, quiet_session.path, "--map", "m")
+    assert (code, "2 logs cannot all write m" in err) == (2, True)
+
+
+def test_a_truncated_log_is_refused_and_salvaged_with_exit_code_3(replay: Run, noisy_session: Session) -> None:
+    data = noisy_session.path.read_bytes()
+    Path("cut.mcap").write_bytes(data[:-200])
+    code, out, err = replay("cut.mcap", "--no-viewer")
+    assert (code, out) == (1, "")
+    assert "truncated" in err and "--recover" in err and err.count("\n") == 1
+    code, _, err = replay("cut.mcap", "--no-viewer", "--recover")
+    assert code == 3
+    assert "note: lost: all beyond byte" in err
+    log = report_of("cut.prob.report.json")["log"]
+    assert (log["recovered"], log["messages_lost"], log["scans"]) == (True, None, noisy_session.scans)
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        (["--resolution", "0"], "--resolution"),
+        (["--resolution", "nan"], "--resolution"),
+        (["--resolution", "1e-5"], "million cells"),
+        (["--bounds", "1", "2", "3"], "--bounds"),
+        (["--bounds", "1", "0", "0", "1"], "X0 must be below X1"),
+        (["--stride", "0"], "--stride"),
+        (["--n-scans", "0"], "--n-scans"),
+        (["--end", "1", "--duration", "1"], "give one of them"),
+        (["--start", "2", "--end", "1"], "not after"),
+        (["--rate", "0"], "--rate"),
+        (["--map-every", "0"], "--map-every"),
+        (["--mapper", "magic"], "--mapper"),
+        (["--pose", "magic"], "--pose"),
+        (["--standing-still", "--pose", "tf"], "exclude"),
+        (["--no-viewer", "--save", "a.rrd"], "excludes"),
+        (["--serve", "--save", "a.rrd"], "excludes"),
+        (["--spawn", "--connect", "rerun+http://127.0.0.1:1/proxy"], "exclude"),
+        (["--connect", "what"], "--connect what"),
+        (["--nonsense"], "--nonsense"),
+    ],
+)
+def test_impossible_options(replay: Run, noisy_session: Session, options: list[str], said: str) -> None:
+    code, out, err = replay(noisy_session.path, *options)
+    assert (code, out) == (2, "")
+    assert said in err
+    assert err.startswith("prim-replay: error: ")
+    assert err.count("\n") == 1
+    assert list(Path().iterdir()) == []
+
+
+def test_selections_that_hold_nothing(replay: Run, noisy_session: Session) -> None:
+    code, _, err = replay(noisy_session.path, "--start", 1000, "--no-viewer")
+    assert (code, "no scan is selected" in err) == (1, True)
+
+
+@pytest.mark.parametrize("option", ["--save", "--report", "--map", "--trajectory"])
+def test_unwritable_outputs(replay: Run, noisy_session: Session, option: str) -> None:
+    code, _, err = replay(noisy_session.path, option, "no/such/folder")
+    assert code == 1
+    assert "cannot write" in err and err.count("\n") == 1
+
+
+def test_spawn_without_a_display(replay: Run, noisy_session: Session, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("DISPLAY", raising=False)
+    monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
+    code, _, err = replay(noisy_session.path, "--spawn")
+    assert (code, "--save" in err, err.count("\n")) == (2, True, 1)
+
+
+def test_a_viewer_that_does_not_answer(replay: Run, noisy_session: Session) -> None:
+    code, _, err = replay(noisy_session.path, "--connect", "rerun+http://127.0.0.1:9/proxy", "--n-scans", 3)
+    assert code == 1
+    assert "no viewer answers" in err and err.count("\n") == 1
+
+
+@pytest.mark.parametrize("content", [b"", b"\x89PNG\r\n\x1a\nxxxxxxxxxxxxxxxx"])
+def test_files_that_are_no_logs(replay: Run, content: bytes) -> None:
+    Path("a.mcap").write_bytes(content)
+    code, out, err = replay("a.mcap")
+    assert (code, out) == (1, "")
+    assert err.startswith("prim-replay: error: a.mcap: ")
+    assert err.count("\n") == 1
+    assert [path.name for path in Path().iterdir()] == ["a.mcap"]
+
+
+def test_a_missing_file_and_a_folder(replay: Run, tmp_path: Path) -> None:
+    for path in ("none.mcap", tmp_path):
+        code, _, err = replay(path)
+        assert (code, err.count("\n")) == (1, 1)

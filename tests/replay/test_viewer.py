@@ -1,0 +1,168 @@
+"""What the recording holds, read back; and a picture of it, where this machine can render one."""
+
+import os
+import shutil
+import subprocess
+import sys
+from collections import defaultdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import rerun as rr
+
+from mapping.grid import OccupancyGrid
+from prim.frames import Pose2D
+from prim.log import LogReader
+from prim.messages import SCAN_TOPIC, decode_scan
+from recorder.session import Session
+from replay.pipeline import Pipeline, ReplayOptions, ReplayResult
+from replay.scans import Selection
+from replay.show import ViewerOptions
+from replay.viewer import RerunViewer
+
+SCREENSHOT = Path(__file__).parents[2] / "docs" / "screenshot.py"
+
+
+def replayed(log: Path, path: Path, **options: Any) -> ReplayResult:
+    viewer = RerunViewer(ViewerOptions(save=path), announce=print)
+    return Pipeline(log, ReplayOptions(**options), viewer).run()
+
+
+def rows_of(path: Path) -> dict[str, list[dict[str, Any]]]:
+    """All rows of a recording by entity, static ones too."""
+    rows = defaultdict(list)
+    for chunk in rr.chunk.RrdReader(path).stream():
+        rows[str(chunk.entity_path)] += chunk.to_record_batch().to_pylist()
+    return rows
+
+
+def value(row: dict[str, Any], component: str) -> Any:
+    return next(item for key, item in row.items() if key.split(":")[-1] == component and item is not None)
+
+
+def timed(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    return [row for row in rows if row.get("scan") is not None]
+
+
+@pytest.fixture(scope="module")
+def recording(noisy_session: Session, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, ReplayResult]:
+    path = tmp_path_factory.mktemp("rrd") / "a.rrd"
+    return path, replayed(noisy_session.path, path, mapper="prob", map_every=5)
+
+
+def test_both_timelines_and_no_other(recording: tuple[Path, ReplayResult]) -> None:
+    path, result = recording
+    scans = timed(rows_of(path)["/map/scan"])
+    assert [row["scan"] for row in scans] == list(range(result.scans))
+    stamps = [np.datetime64(row["stamp"], "ns").astype(int) for row in scans]
+    assert stamps == result.stamps.tolist()
+    assert not any("log_time" in row or "log_tick" in row for rows in rows_of(path).values() for row in rows)
+
+
+def test_scans_are_drawn_where_they_hit(recording: tuple[Path, ReplayResult], noisy_session: Session) -> None:
+    path, result = recording
+    with LogReader(noisy_session.path) as log:
+        scans = [scan for _, scan in log.decoded(log.topics[SCAN_TOPIC], decode_scan)]
+    for row in timed(rows_of(path)["/map/scan"])[::7]:
+        points = np.array(value(row, "positions"))[:, :2]
+        pose = Pose2D(*result.poses.poses[row["scan"]])
+        assert points == pytest.approx(scans[row["scan"]].points(pose), abs=1e-5)
+
+
+def test_the_map_is_neither_mirrored_nor_shifted(recording: tuple[Path, ReplayResult]) -> None:
+    """rerun's grid has its first row at the top: the image, flipped back, is the grid."""
+    path, result = recording
+    maps = timed(rows_of(path)["/map/grid"])
+    assert {row["scan"] for row in maps} == {0, 5, 10, 15, 20, result.scans - 1}
+    assert grid_values(maps[-1]) == pytest.approx(expected_values(result.grid))
+    assert value(maps[-1], "translation")[0][:2] == pytest.approx(result.grid.frame.origin)
+    assert value(maps[-1], "cell_size") == pytest.approx([0.01])
+
+
+def grid_values(row: dict[str, Any]) -> np.ndarray:
+    form = value(row, "format")[0]
+    data = np.frombuffer(bytes(value(row, "data")[0]), np.uint8)
+    return np.flipud(data.reshape(form["height"], form["width"]))
+
+
+def expected_values(grid: OccupancyGrid) -> np.ndarray:
+    return np.where(grid.probability == 0.5, 255, np.rint(grid.probability * 100))
+
+
+def test_scores_over_time_end_at_the_reports(recording: tuple[Path, ReplayResult]) -> None:
+    path, result = recording
+    last = timed(rows_of(path)["/scores"])[-1]
+    assert result.scores is not None
+    scores = result.scores
+    expected = [
+        *(scores.occupied_f1, scores.occupied_precision, scores.occupied_recall, scores.free_accuracy, scores.auc)
+    ]
+    assert value(last, "scalars") == pytest.approx(expected)
+
+
+def test_truth_events_and_summary_are_there(recording: tuple[Path, ReplayResult], noisy_session: Session) -> None:
+    rows = rows_of(recording[0])
+    outlines = value(rows["/map/truth/primitives"][0], "strips")
+    assert len(outlines) == len(noisy_session.world.primitives)
+    for outline, primitive in zip(outlines, noisy_session.world.primitives, strict=True):
+        assert np.array(outline)[:-1, :2] == pytest.approx(primitive.outline(64), abs=1e-6)
+    assert len(value(rows["/map/truth/walls"][0], "strips")) == 4
+    texts = [value(row, "text")[0] for row in rows["/events"]]
+    assert texts == ["23 of 23 scans on /scan", "poses: truth (/ground_truth/pose)"]
+    assert "precision" in value(rows["/summary"][0], "text")[0]
+    assert rows["/timing"]
+
+
+def test_a_blueprint_is_saved_with_it(recording: tuple[Path, ReplayResult]) -> None:
+    stores = subprocess.run(
+        [shutil.which("rerun") or "rerun", "rrd", "print", recording[0]], capture_output=True, text=True, check=False
+    )
+    assert "Spatial3DView" in stores.stdout or "blueprint" in stores.stdout.lower()
+
+
+def test_pose_errors_are_drawn_where_poses_are_compared(noisy_session: Session, tmp_path: Path) -> None:
+    result = replayed(noisy_session.path, tmp_path / "a.rrd", pose="odom")
+    errors = timed(rows_of(tmp_path / "a.rrd")["/pose_error/position"])
+    assert len(errors) == result.scans
+    assert value(errors[-1], "scalars") == pytest.approx([0], abs=1e-6)
+
+
+def test_a_selection_and_a_rate(noisy_session: Session, tmp_path: Path) -> None:
+    viewer = RerunViewer(ViewerOptions(save=tmp_path / "a.rrd", live=True), announce=print)
+    Pipeline(noisy_session.path, ReplayOptions(selection=Selection(n_scans=4), rate=100.0), viewer).run()
+    assert len(timed(rows_of(tmp_path / "a.rrd")["/map/scan"])) == 4
+
+
+def can_render() -> bool:
+    """Whether a Vulkan driver is installed; rerun needs one to draw without a screen."""
+    folders = ("/usr/share/vulkan/icd.d", "/etc/vulkan/icd.d")
+    return bool(os.environ.get("VK_DRIVER_FILES")) or any(
+        Path(folder).is_dir() and any(Path(folder).iterdir()) for folder in folders
+    )
+
+
+@pytest.mark.skipif(not can_render(), reason="no Vulkan driver here to render with (mesa-vulkan-drivers)")
+def test_the_viewer_draws_it_without_complaint(recording: tuple[Path, ReplayResult], tmp_path: Path) -> None:
+    picture = tmp_path / "a.png"
+    done = subprocess.run(
+        [sys.executable, SCREENSHOT, recording[0], picture], capture_output=True, text=True, check=False, timeout=120
+    )
+    assert done.returncode == 0, done.stderr
+    assert picture.read_bytes().startswith(b"\x89PNG")
+    assert picture.stat().st_size > 30_000
+
+
+def test_a_log_of_ours_opens_in_reruns_own_importer(noisy_session: Session, tmp_path: Path) -> None:
+    """Its importer draws the poses and the transforms of a ROS 2 log; a log it cannot read leaves nothing."""
+    converted = tmp_path / "a.rrd"
+    rerun = shutil.which("rerun") or str(Path(sys.executable).with_name("rerun"))
+    subprocess.run(
+        [rerun, "mcap", "convert", noisy_session.path, "-o", converted], capture_output=True, check=True, timeout=60
+    )
+    rows = rows_of(converted)
+    drawn = {"/ground_truth/pose": "InstancePoses3D:translations", "/tf": "Transform3D:translation"}
+    for entity, component in drawn.items():
+        assert sum(component in row for row in rows[entity]) == noisy_session.scans
+    assert sum("Transform3D:translation" in row for row in rows["/tf_static"]) == 1
