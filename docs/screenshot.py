@@ -7,9 +7,14 @@ something.
 
 from __future__ import annotations
 
+import os
+import socket
 import subprocess
 import sys
+import tempfile
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
@@ -36,12 +41,30 @@ def reports(client: ViewerClient) -> list[str]:
     return [f"{view.name}: {report}" for view in client.get_state().views for report in view.reports]
 
 
+@contextmanager
+def settings_apart() -> Iterator[None]:
+    """Keeps the viewer quiet, off the network, and away from the user's own settings of it."""
+    with tempfile.TemporaryDirectory() as folder:
+        Path(folder).chmod(0o700)
+        places = dict.fromkeys(("XDG_CONFIG_HOME", "XDG_DATA_HOME", "XDG_CACHE_HOME", "XDG_RUNTIME_DIR"), folder)
+        path = f"{Path(sys.executable).parent}{os.pathsep}{os.environ.get('PATH', '')}"
+        os.environ.update(places | {"RUST_LOG": "error", "PATH": path})
+        subprocess.run(["rerun", "analytics", "disable"], check=True, capture_output=True)
+        yield
+
+
+def free_port() -> int:
+    """A port that nothing listens on."""
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return int(probe.getsockname()[1])
+
+
 def main(recording: Path, picture: Path, share: float) -> int:
     """Opens the recording in a viewer without a window and saves what it shows."""
     scan = round(last_scan(recording) * share)
-    subprocess.run(["rerun", "analytics", "disable"], check=False, capture_output=True)
     try:
-        with ViewerClient.spawn(headless=True, port=9912) as client:
+        with settings_apart(), ViewerClient.spawn(headless=True, port=free_port()) as client:
             client.open(str(recording.resolve()))
             time.sleep(2)
             client.set_time(TIMELINE, sequence=scan, play_state="paused")
