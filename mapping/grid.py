@@ -8,15 +8,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from mapping.rays import BORDER_SLACK
 from prim.errors import UsageError
 from prim.world import Bounds
 
 UNKNOWN = np.float32(0.5)
 MAX_CELLS = 400_000_000
 """A grid of more cells is refused: it would not fit the memory of a laptop."""
-
-BORDER_SLACK = 1e-6
-"""A point this close below a cell's border (in cells) counts as on it: 0.3 / 0.1 is 2.9999999999999996."""
 
 
 def cell_of(coordinate: float, resolution: float) -> int:

@@ -4,6 +4,9 @@ A ray is Bresenham's line from the sensor's cell to the cell of its end point, s
 steps, step k lies at minor offset floor(k * m / n + 1/2) for m minor cells in all; here that is computed in
 40-bit fixed point with the slope rounded up, which is exact for lines of up to 700,000 cells and lets no cell
 wait for the one before it. Clipping to the grid is exact as well: it picks the range of k and moves no cell.
+
+Compiled code is cached beside this file and made anew when this file changes, so that every constant it uses must
+stand here.
 """
 
 from __future__ import annotations
@@ -14,7 +17,12 @@ from typing import Any
 import numpy as np
 from numba import njit
 
-from mapping.grid import BORDER_SLACK
+BORDER_SLACK = 1e-3
+"""A point this close below a cell's border (in cells) counts as on it.
+
+0.3 / 0.1 is 2.9999999999999996, and a range in single precision is off by up to 1e-4 cells: without the slack a wall
+that stands on a border would be torn between the cells at its two sides.
+"""
 
 SHIFT = 40
 ONE = 1 << SHIFT
@@ -149,13 +157,10 @@ def mark(
         end_col = cell(x + z * (cos * u - sin * v), inverse_resolution) - col0
         end_row = cell(y + z * (sin * u + cos * v), inverse_resolution) - row0
         steps, tilt, major, minor = line(row, col, end_row, end_col, cols)
-        last = steps
-        if kind == HIT:
-            last = steps - 1
-            if 0 <= end_row < rows and 0 <= end_col < cols:
-                hits[count] = end_row * cols + end_col
-                count += 1
-        first, last = clip(row, col, rows, cols, major, tilt, minor, last)
+        if kind == HIT and 0 <= end_row < rows and 0 <= end_col < cols:
+            hits[count] = end_row * cols + end_col
+            count += 1
+        first, last = clip(row, col, rows, cols, major, tilt, minor, steps)
         position = start + first * major
         offset = first * tilt + HALF
         for _ in range(first, last + 1):

@@ -8,7 +8,6 @@ from dataclasses import asdict, dataclass
 from typing import SupportsInt
 
 import numpy as np
-import shapely
 from numpy.typing import NDArray
 
 from prim.shapes import FloatArray, Primitive, angle_error
@@ -76,6 +75,8 @@ class MapScores:
 
 def polygon_iou(a: Primitive, b: Primitive) -> float:
     """Intersection over union of two outlines' polygons."""
+    import shapely  # when it is needed: a replay without detections starts faster
+
     first, second = shapely.Polygon(a.outline()), shapely.Polygon(b.outline())
     shared: float = first.intersection(second).area
     return shared / (float(first.area) + float(second.area) - shared)

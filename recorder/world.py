@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import islice
 
 import numpy as np
 import shapely
@@ -17,7 +18,7 @@ GAP = 0.03
 """Primitives keep this far (m) from each other and from the floor's edge."""
 
 _TRIES_PER_PRIMITIVE = 200
-_TRIES_PER_WORLD = 500
+_TRIES = 20_000
 _MIN_TRIANGLE_HEIGHT = 0.06
 
 
@@ -33,27 +34,31 @@ class WorldOptions:
 
 def draw_world(rng: np.random.Generator, options: WorldOptions) -> World:
     """Draws a world. Raises UsageError where the primitives asked for do not fit on the floor."""
-    for _ in range(_TRIES_PER_WORLD):
+    tries = iter(range(_TRIES))
+    while True:
         fewest, most = options.per_kind
         kinds = [kind for kind in options.kinds for _ in range(rng.integers(fewest, most, endpoint=True))]
-        primitives = _place(rng, kinds, options.size)
+        primitives = _place(rng, kinds, options.size, tries)
         if primitives is not None:
             world = World(options.size, tuple(primitives))
             return world.walled() if options.walls else world
-    width, height = options.size
-    raise UsageError(
-        f"{options.per_kind[1]} of each of {len(options.kinds)} kinds do not fit on {width:g} x {height:g} m: "
-        "give a larger --size or a smaller --per-kind"
-    )
+        if next(tries, None) is None:
+            width, height = options.size
+            raise UsageError(
+                f"{most} of each of {len(options.kinds)} kinds do not fit on {width:g} x {height:g} m: "
+                "give a larger --size or a smaller --per-kind"
+            )
 
 
-def _place(rng: np.random.Generator, kinds: Sequence[Kind], size: tuple[float, float]) -> list[Primitive] | None:
-    """Primitives of these kinds, apart from each other; None where one found no place."""
+def _place(
+    rng: np.random.Generator, kinds: Sequence[Kind], size: tuple[float, float], tries: Iterator[int]
+) -> list[Primitive] | None:
+    """Primitives of these kinds, apart from each other; None where one found no place or no ``tries`` are left."""
     placed: list[Primitive] = []
     outlines: list[shapely.Polygon] = []
     floor = shapely.box(-size[0] / 2, -size[1] / 2, size[0] / 2, size[1] / 2).buffer(-GAP, join_style="mitre")
     for kind in kinds:
-        for _ in range(_TRIES_PER_PRIMITIVE):
+        for _ in islice(tries, _TRIES_PER_PRIMITIVE):
             primitive = draw_primitive(rng, kind, size)
             outline = shapely.Polygon(primitive.outline())
             if floor.contains(outline) and all(outline.distance(other) >= GAP for other in outlines):

@@ -100,7 +100,8 @@ def test_a_ray_never_frees_the_cell_that_it_hits_nor_one_that_another_hits() -> 
     ("coordinate", "resolution", "cell"),
     [
         (0.3, 0.1, 3),
-        (0.29999, 0.1, 2),
+        (0.2998, 0.1, 2),
+        (0.29999, 0.1, 3),
         (-0.3, 0.1, -3),
         (0.0, 0.1, 0),
         (1.0, 0.01, 100),

@@ -51,7 +51,9 @@ def test_one_of_two_detections_of_one_thing_counts() -> None:
 
 
 def test_the_right_kind_goes_before_a_better_overlap() -> None:
-    pairs = match_primitives([square(0, 0.19), circle(0.01)], [circle(0.0)])
+    detections, truth = [square(0, 0.19), circle(0.03)], [circle(0.0)]
+    assert polygon_iou(detections[0], truth[0]) > polygon_iou(detections[1], truth[0]) > 0.5
+    pairs = match_primitives(detections, truth)
     assert pairs[0].detection == 1
 
 

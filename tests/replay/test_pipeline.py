@@ -1,0 +1,93 @@
+"""The pipeline as a library: lasers that hang upside down, truth that moves, the same result every time."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from prim.frames import Pose2D
+from prim.log import LogWriter
+from prim.messages import (
+    MARKERS_TYPE,
+    POSE_TYPE,
+    SCAN_TYPE,
+    TF_TYPE,
+    encode_pose,
+    encode_primitives,
+    encode_scan,
+)
+from prim.shapes import Kind, Primitive
+from prim.world import World
+from recorder.sensors import Lidar
+from recorder.session import Session
+from replay.pipeline import Pipeline, ReplayOptions, ReplayResult
+from tests.replay.test_localize import raw_transform
+
+STAMP = 5 * 10**9
+POSE = Pose2D(0.2, -0.1, 0.7)
+WORLD = World((2.0, 2.0), (Primitive(Kind.TRIANGLE, 0.5, 0.4, 1.0, (0.2, 0.3)),)).walled()
+
+
+def write(path: Path, rolled: bool) -> Path:
+    """A session of one scan; the beams of a laser that hangs upside down come in the other order."""
+    scan = Lidar(noise_std=0.0).measure(WORLD, POSE, STAMP, 0.1, np.random.default_rng(0))
+    with LogWriter(path) as log:
+        log.attach("world.json", "application/json", json.dumps(WORLD.to_json()).encode(), STAMP)
+        log.add_topic("/scan", SCAN_TYPE)
+        log.add_topic("/ground_truth/pose", POSE_TYPE)
+        raw_transform("base_link", "laser", (1.0, 0.0, 0.0, 0.0) if rolled else (0.0, 0.0, 0.0, 1.0))(log)
+        log.write("/ground_truth/pose", STAMP, encode_pose(STAMP, POSE))
+        log.write("/scan", STAMP, encode_scan(replace(scan, ranges=scan.ranges[:: -1 if rolled else 1].copy())))
+    return path
+
+
+@pytest.mark.parametrize("mapper", ["det", "prob"])
+def test_a_laser_that_hangs_upside_down_maps_the_same(tmp_path: Path, mapper: str) -> None:
+    upright, rolled = (
+        Pipeline(write(tmp_path / f"{rolled}.mcap", rolled), ReplayOptions(mapper=mapper)).run()
+        for rolled in (False, True)
+    )
+    assert np.mean(upright.grid.probability != rolled.grid.probability) < 1e-3
+    assert rolled.scores is not None
+    assert rolled.scores.occupied_recall is not None and rolled.scores.occupied_recall > 0.95
+
+
+def test_truth_that_moves_is_followed(tmp_path: Path) -> None:
+    """The triangle is logged elsewhere before the second scan: what det marks there is right."""
+    moved = replace(WORLD, primitives=(replace(WORLD.primitives[0], x=-0.5),))
+    with LogWriter(tmp_path / "a.mcap") as log:
+        log.attach("world.json", "application/json", json.dumps(WORLD.to_json()).encode(), STAMP)
+        for topic, kind in (
+            ("/scan", SCAN_TYPE),
+            ("/ground_truth/pose", POSE_TYPE),
+            ("/ground_truth/primitives", MARKERS_TYPE),
+            ("/tf", TF_TYPE),
+        ):
+            log.add_topic(topic, kind)
+        for index, world in enumerate((WORLD, moved)):
+            stamp = STAMP + index * 10**9
+            log.write("/ground_truth/primitives", stamp, encode_primitives(stamp, world))
+            log.write("/ground_truth/pose", stamp, encode_pose(stamp, POSE))
+            scan = Lidar(noise_std=0.0).measure(world, POSE, stamp, 0.1, np.random.default_rng(0))
+            log.write("/scan", stamp, encode_scan(scan))
+    result = Pipeline(tmp_path / "a.mcap", ReplayOptions(mapper="det")).run()
+    assert result.scores is not None
+    assert result.scores.occupied_precision == 1
+    marked = result.grid.centres(result.grid.occupied)
+    assert np.count_nonzero(np.hypot(marked[:, 0] + 0.5, marked[:, 1] - 0.4) < 0.25) > 10
+
+
+def test_a_replay_can_be_repeated(noisy_session: Session) -> None:
+    def run() -> ReplayResult:
+        return Pipeline(noisy_session.path, ReplayOptions(mapper="prob")).run()
+
+    first, second = run(), run()
+    assert (first.grid.probability == second.grid.probability).all()
+    assert first.scores == second.scores
+
+
+def test_rays_that_were_not_used_are_not_counted(noisy_session: Session) -> None:
+    result = Pipeline(noisy_session.path, ReplayOptions()).run()
+    assert result.rays == result.scans_used * 180
