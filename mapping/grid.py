@@ -13,7 +13,7 @@ from prim.errors import UsageError
 from prim.world import Bounds
 
 UNKNOWN = np.float32(0.5)
-MAX_CELLS = 400_000_000
+MAX_CELLS = 200_000_000
 """A grid of more cells is refused: it would not fit the memory of a laptop."""
 
 
@@ -76,9 +76,8 @@ class GridFrame:
         cols = max(self.col + self.cols, other.col + other.cols) - col
         return GridFrame(self.resolution, row, col, rows, cols)
 
-    def padded(self, share: float) -> GridFrame:
-        """A frame larger by ``share`` of the larger side on all sides."""
-        pad = math.ceil(share * max(self.rows, self.cols))
+    def padded(self, pad: int) -> GridFrame:
+        """A frame larger by ``pad`` cells on all sides."""
         return GridFrame(self.resolution, self.row - pad, self.col - pad, self.rows + 2 * pad, self.cols + 2 * pad)
 
     def window(self, inner: GridFrame) -> tuple[slice, slice]:
@@ -114,13 +113,22 @@ class OccupancyGrid:
 class Layer:
     """An array over the plane's cells that grows, or is held to given bounds.
 
-    ``array`` covers ``frame``; ``used`` is the part of it that has been asked for.
+    ``array`` covers ``frame``; ``used`` is the part of it that has been asked for. A growing array reaches at least
+    ``margin`` metres beyond that.
     """
 
-    def __init__(self, resolution: float, bounds: Bounds | None, fill: float, dtype: type[np.generic]) -> None:
+    def __init__(
+        self,
+        resolution: float,
+        bounds: Bounds | None,
+        fill: float,
+        dtype: type[np.generic],
+        margin: float = 0.0,
+    ) -> None:
         self.resolution = resolution
         self.fixed = bounds is not None
         self.fill = fill
+        self.margin = math.ceil(margin / resolution) + 1
         self.frame = GridFrame.covering(bounds or (0.0, 0.0, resolution, resolution), resolution)
         self.used: GridFrame | None = self.frame if self.fixed else None
         self.array = np.full(self.frame.shape, fill, dtype)
@@ -130,13 +138,14 @@ class Layer:
         if self.fixed:
             return
         needed = GridFrame(self.resolution, row, col, last_row - row + 1, last_col - col + 1)
-        self.used = needed if self.used is None else self.used.union(needed)
-        if self.used.union(self.frame) == self.frame:
+        before, self.used = self.used, needed if self.used is None else self.used.union(needed)
+        if before and self.used.padded(self.margin).union(self.frame) == self.frame:
             return
-        grown = self.used.padded(0.25)
+        grown = self.used.padded(self.margin + max(self.used.shape) // 4)
+        if before:
+            grown = grown.union(self.frame)
         array = np.full(grown.shape, self.fill, self.array.dtype)
-        shared = self.frame if grown.union(self.frame) == grown else self.used
-        if shared == self.frame:
+        if before:
             array[grown.window(self.frame)] = self.array
         self.frame, self.array = grown, array
 

@@ -18,7 +18,7 @@ HIT_PROBABILITY = 0.9
 REACH = 0.03
 """Eq. 4's model ends this far (m) before and behind the measured range."""
 
-_TABLE_STEPS = 600
+_TABLE_STEPS = 300
 
 
 def log_odds(probability: FloatArray | float) -> FloatArray:
@@ -29,8 +29,11 @@ def log_odds(probability: FloatArray | float) -> FloatArray:
 
 def probability_of(odds: NDArray[np.floating]) -> NDArray[np.float32]:
     """Eq. 2: 1 - 1 / (1 + exp(l)), in single precision."""
+    probability = -np.asarray(odds, dtype=np.float32)
     with np.errstate(over="ignore"):
-        return np.asarray(1 / (1 + np.exp(-odds)), dtype=np.float32)
+        np.exp(probability, out=probability)
+    probability += 1
+    return np.reciprocal(probability, out=probability)
 
 
 def inverse_sensor_model(d: FloatArray | float) -> FloatArray:
@@ -53,9 +56,9 @@ class ProbabilisticMapper:
 
     def __init__(self, resolution: float = 0.01, bounds: Bounds | None = None) -> None:
         self.resolution = resolution
-        self._layer = Layer(resolution, bounds, 0.0, np.float32)
-        self._free = float(log_odds(FREE_PROBABILITY))
-        self._table = log_odds(inverse_sensor_model(np.linspace(-REACH, REACH, 2 * _TABLE_STEPS + 1)))
+        self._layer = Layer(resolution, bounds, 0.0, np.float32, margin=REACH)
+        distances = np.linspace(-REACH, REACH, 2 * _TABLE_STEPS + 1)
+        self._table = log_odds(inverse_sensor_model(distances)).astype(np.float32)
 
     def update(self, scan: Scan, pose: Pose2D) -> None:
         """Adds one scan, taken by a laser at ``pose`` in the map frame."""
@@ -65,12 +68,12 @@ class ProbabilisticMapper:
         layer = self._layer
         if not layer.fixed:
             layer.cover(*end_extent(*rays))
-        add_log_odds(layer.array, layer.frame.row, layer.frame.col, *rays, self._free, REACH, self._table)
+        add_log_odds(layer.array, layer.frame.row, layer.frame.col, *rays, REACH, self._table)
 
     def grid(self) -> OccupancyGrid:
         """The map so far."""
         frame, odds = self._layer.crop()
-        return OccupancyGrid(frame, probability_of(odds.astype(np.float32)))
+        return OccupancyGrid(frame, probability_of(np.asarray(odds, dtype=np.float32)))
 
     def finish(self) -> OccupancyGrid:
         """The map of all scans."""

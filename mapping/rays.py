@@ -2,8 +2,9 @@
 
 A ray is Bresenham's line from the sensor's cell to the cell of its end point, stepped along its major axis. Of n
 steps, step k lies at minor offset floor(k * m / n + 1/2) for m minor cells in all; here that is computed in
-40-bit fixed point with the slope rounded up, which is exact for lines of up to 700,000 cells and lets no cell
-wait for the one before it. Clipping to the grid is exact as well: it picks the range of k and moves no cell.
+40-bit fixed point, which lets no cell wait for the one before it. The slope is the next whole number above
+2^40 m / n, so that a step's offset is too large by less than 1 / 2n: the result is exact for lines of up to 700,000
+cells. Clipping to the grid is exact as well: it picks the range of k and moves no cell.
 
 Compiled code is cached beside this file and made anew when this file changes, so that every constant it uses must
 stand here.
@@ -25,10 +26,10 @@ that stands on a border would be torn between the cells at its two sides.
 """
 
 SHIFT = 40
-ONE = 1 << SHIFT
+ONE = float(1 << SHIFT)
 HALF = 1 << (SHIFT - 1)
 MAX_STEPS = float(1 << 21)
-"""No ray is followed over more cells than this."""
+"""No ray is followed over more cells than this, and no scan is used from farther off the grid."""
 
 SKIPPED, HIT, NO_RETURN = 0, 1, 2
 FREE, OCCUPIED, UNSEEN = 0, 1, 2
@@ -52,53 +53,103 @@ def cell(coordinate: float, inverse_resolution: float) -> int:
 
 
 @inline
-def line(row: int, col: int, end_row: int, end_col: int, width: int) -> tuple[int, int, int, int]:
-    """The line between two cells: its steps, fixed-point slope, and flat strides along both axes."""
-    rows, cols = end_row - row, end_col - col
-    row_stride = width if rows >= 0 else -width
-    col_stride = 1 if cols >= 0 else -1
+def is_near(coordinate: float, inverse_resolution: float, first_cell: int, cells: int) -> bool:
+    """Whether a coordinate (m) is a number, and lies within MAX_STEPS cells of the grid along one axis."""
+    return -MAX_STEPS < coordinate * inverse_resolution - first_cell < cells + MAX_STEPS
+
+
+@inline
+def line(rows: int, cols: int, width: int, dx: float, dy: float) -> tuple[int, int, int, int]:
+    """The line over so many rows and columns of a flat grid: steps, tilt, and strides along both of its axes.
+
+    The tilt is the fixed-point number of minor cells per step. A line within one cell has 0 steps and goes on, if
+    at all, along the beam's own direction (dx, dy).
+    """
+    row_stride = width if dy >= 0 else -width
+    col_stride = 1 if dx >= 0 else -1
     rows, cols = abs(rows), abs(cols)
+    if rows == 0 and cols == 0:
+        dx, dy = abs(dx), abs(dy)
+        if dx >= dy:
+            return 0, tilt_of(dy, dx), col_stride, row_stride
+        return 0, tilt_of(dx, dy), row_stride, col_stride
     if cols >= rows:
-        return cols, slope(rows, cols), col_stride, row_stride
-    return rows, slope(cols, rows), row_stride, col_stride
+        return cols, tilt_of(rows, cols), col_stride, row_stride
+    return rows, tilt_of(cols, rows), row_stride, col_stride
 
 
 @inline
-def slope(minor: int, steps: int) -> int:
-    """Minor cells per step in fixed point, rounded up."""
-    return ((minor << SHIFT) + steps - 1) // steps if steps > 0 else 0
+def tilt_of(minor: float, major: float) -> int:
+    """The smallest whole number above minor / major * 2^40 (in double precision: within 2^-13 of it)."""
+    return int(minor * ONE / major) + 1
 
 
 @inline
-def clip(row: int, col: int, rows: int, cols: int, major: int, slope: int, minor: int, last: int) -> tuple[int, int]:
+def clip(row: int, col: int, rows: int, cols: int, major: int, minor: int, tilt: int, last: int) -> tuple[int, int]:
     """Of a line's steps 0..last the first and the last within the grid; none where the first is larger."""
-    if major == 1 or major == -1:
-        return _clip(col, cols, major > 0, row, rows, minor > 0, slope, last)
-    return _clip(row, rows, major > 0, col, cols, minor > 0, slope, last)
+    if abs(major) == 1:
+        return _clip(col, cols, major > 0, row, rows, minor > 0, tilt, last)
+    return _clip(row, rows, major > 0, col, cols, minor > 0, tilt, last)
 
 
 @inline
 def _clip(
-    start: int, size: int, up: bool, minor_start: int, minor_size: int, minor_up: bool, slope: int, last: int
+    start: int, size: int, up: bool, minor_start: int, minor_size: int, minor_up: bool, tilt: int, last: int
 ) -> tuple[int, int]:
     """As clip, for one orientation: steps that keep both coordinates within [0, size) and [0, minor_size)."""
-    first = max(0, -start if up else start - size + 1)
-    last = min(last, size - 1 - start if up else start)
     enter = -minor_start if minor_up else minor_start - minor_size + 1
     leave = minor_size - minor_start if minor_up else minor_start + 1
-    if leave <= 0 or (slope == 0 and enter > 0):
+    if leave <= 0 or enter > last + 1:
         return 1, 0
-    if slope > 0:
-        if enter > 0:
-            first = max(first, first_step(enter, slope))
-        last = min(last, first_step(leave, slope) - 1)
-    return first, last
+    first = first_step(enter, tilt) if enter > 0 else 0
+    if leave <= last + 1:  # else it stays within
+        last = min(last, first_step(leave, tilt) - 1)
+    first = max(first, -start if up else start - size + 1)
+    return first, min(last, size - 1 - start if up else start)
 
 
 @inline
-def first_step(minor: int, slope: int) -> int:
-    """The first step whose minor offset (step * slope + HALF) >> SHIFT is at least ``minor`` > 0."""
-    return ((minor << SHIFT) - HALF + slope - 1) // slope
+def first_step(minor: int, tilt: int) -> int:
+    """The first step whose minor offset (step * tilt + HALF) >> SHIFT is at least ``minor`` > 0."""
+    return ((minor << SHIFT) - HALF + tilt - 1) // tilt
+
+
+@inline
+def set_line(flat: Any, value: Any, start: int, first: int, last: int, tilt: int, major: int, minor: int) -> None:
+    """Sets the cells of a line's steps first..last, four at a time: none of them waits for another."""
+    p0, o0 = start + first * major, HALF + first * tilt
+    p1, o1, two_majors, two_tilts = p0 + major, o0 + tilt, 2 * major, 2 * tilt
+    p2, o2, p3, o3 = p0 + two_majors, o0 + two_tilts, p1 + two_majors, o1 + two_tilts
+    count = max(last - first + 1, 0)
+    for _ in range(count >> 2):
+        flat[np.uintp(p0 + (o0 >> SHIFT) * minor)] = value
+        flat[np.uintp(p1 + (o1 >> SHIFT) * minor)] = value
+        flat[np.uintp(p2 + (o2 >> SHIFT) * minor)] = value
+        flat[np.uintp(p3 + (o3 >> SHIFT) * minor)] = value
+        p0, p1, p2, p3 = p0 + 2 * two_majors, p1 + 2 * two_majors, p2 + 2 * two_majors, p3 + 2 * two_majors
+        o0, o1, o2, o3 = o0 + 2 * two_tilts, o1 + 2 * two_tilts, o2 + 2 * two_tilts, o3 + 2 * two_tilts
+    for _ in range(count & 3):
+        flat[np.uintp(p0 + (o0 >> SHIFT) * minor)] = value
+        p0, o0 = p0 + major, o0 + tilt
+
+
+@inline
+def add_line(flat: Any, value: Any, start: int, first: int, last: int, tilt: int, major: int, minor: int) -> None:
+    """As set_line, but adds to the cells."""
+    p0, o0 = start + first * major, HALF + first * tilt
+    p1, o1, two_majors, two_tilts = p0 + major, o0 + tilt, 2 * major, 2 * tilt
+    p2, o2, p3, o3 = p0 + two_majors, o0 + two_tilts, p1 + two_majors, o1 + two_tilts
+    count = max(last - first + 1, 0)
+    for _ in range(count >> 2):
+        flat[np.uintp(p0 + (o0 >> SHIFT) * minor)] += value
+        flat[np.uintp(p1 + (o1 >> SHIFT) * minor)] += value
+        flat[np.uintp(p2 + (o2 >> SHIFT) * minor)] += value
+        flat[np.uintp(p3 + (o3 >> SHIFT) * minor)] += value
+        p0, p1, p2, p3 = p0 + 2 * two_majors, p1 + 2 * two_majors, p2 + 2 * two_majors, p3 + 2 * two_majors
+        o0, o1, o2, o3 = o0 + 2 * two_tilts, o1 + 2 * two_tilts, o2 + 2 * two_tilts, o3 + 2 * two_tilts
+    for _ in range(count & 3):
+        flat[np.uintp(p0 + (o0 >> SHIFT) * minor)] += value
+        p0, o0 = p0 + major, o0 + tilt
 
 
 @kernel
@@ -107,11 +158,12 @@ def end_extent(
 ) -> tuple[int, int, int, int]:
     """First and last row and column over the sensor's cell and the cells of all hits."""
     x, y, cos, sin = pose
+    far = min(limits[1], MAX_STEPS / inverse_resolution)
     first_row = last_row = cell(y, inverse_resolution)
     first_col = last_col = cell(x, inverse_resolution)
     for i in range(ranges.shape[0]):
         z = float(ranges[i])
-        if classify(z, limits[0], limits[1]) == HIT:
+        if classify(z, limits[0], limits[1]) == HIT and z < far:
             u, v = directions[i, 0], directions[i, 1]
             col = cell(x + z * (cos * u - sin * v), inverse_resolution)
             row = cell(y + z * (sin * u + cos * v), inverse_resolution)
@@ -122,14 +174,7 @@ def end_extent(
 
 @kernel
 def mark(
-    states: Any,
-    row0: int,
-    col0: int,
-    ranges: Any,
-    directions: Any,
-    pose: Any,
-    limits: Any,
-    inverse_resolution: float,
+    states: Any, row0: int, col0: int, ranges: Any, directions: Any, pose: Any, limits: Any, inverse_resolution: float
 ) -> Any:
     """One scan into a grid of states (the paper's III-A): first all rays free their cells, then hits are marked.
 
@@ -144,9 +189,12 @@ def mark(
     range_min, range_max = limits
     far = min(range_max, MAX_STEPS / inverse_resolution)
     row, col = cell(y, inverse_resolution) - row0, cell(x, inverse_resolution) - col0
+    starts_inside = 0 <= row < rows and 0 <= col < cols
     start = row * cols + col
     hits = np.empty(ranges.shape[0], np.int64)
     count = 0
+    if not (is_near(x, inverse_resolution, col0, cols) and is_near(y, inverse_resolution, row0, rows)):
+        return hits[:0]
     for i in range(ranges.shape[0]):
         z = float(ranges[i])
         kind = classify(z, range_min, range_max)
@@ -154,19 +202,18 @@ def mark(
             continue
         z = min(z, far)
         u, v = directions[i, 0], directions[i, 1]
-        end_col = cell(x + z * (cos * u - sin * v), inverse_resolution) - col0
-        end_row = cell(y + z * (sin * u + cos * v), inverse_resolution) - row0
-        steps, tilt, major, minor = line(row, col, end_row, end_col, cols)
-        if kind == HIT and 0 <= end_row < rows and 0 <= end_col < cols:
+        dx, dy = cos * u - sin * v, sin * u + cos * v
+        end_col = cell(x + z * dx, inverse_resolution) - col0
+        end_row = cell(y + z * dy, inverse_resolution) - row0
+        steps, tilt, major, minor = line(end_row - row, end_col - col, cols, dx, dy)
+        first, last = 0, steps
+        ends_inside = 0 <= end_row < rows and 0 <= end_col < cols
+        if not (starts_inside and ends_inside):
+            first, last = clip(row, col, rows, cols, major, minor, tilt, steps)
+        set_line(flat, FREE, start, first, last, tilt, major, minor)
+        if kind == HIT and ends_inside:
             hits[count] = end_row * cols + end_col
             count += 1
-        first, last = clip(row, col, rows, cols, major, tilt, minor, steps)
-        position = start + first * major
-        offset = first * tilt + HALF
-        for _ in range(first, last + 1):
-            flat[np.uintp(position + (offset >> SHIFT) * minor)] = FREE
-            position += major
-            offset += tilt
     for i in range(count):
         flat[hits[i]] = OCCUPIED
     return hits[:count]
@@ -182,14 +229,14 @@ def add_log_odds(
     pose: Any,
     limits: Any,
     inverse_resolution: float,
-    free: float,
     reach: float,
     table: Any,
 ) -> None:
     """One scan into a grid of log-odds (Eqs. 3 and 4), one update per ray and cell.
 
-    Arguments as in :func:`mark`, and the inverse sensor model in log-odds: ``free`` up to ``reach`` metres
-    before the measured range, then ``table``, equally spaced over [-reach, reach], 0 beyond.
+    Arguments as in :func:`mark`, and the inverse sensor model in log-odds: ``table`` (float32) holds it at equal
+    steps from ``reach`` metres before the measured range, where it begins to differ from free, to as far behind
+    it, where it ends in 0.
     """
     rows, cols = log_odds.shape
     flat = log_odds.reshape(-1)
@@ -198,10 +245,12 @@ def add_log_odds(
     far = min(range_max, MAX_STEPS / inverse_resolution)
     resolution = 1 / inverse_resolution
     row, col = cell(y, inverse_resolution) - row0, cell(x, inverse_resolution) - col0
+    starts_inside = 0 <= row < rows and 0 <= col < cols
     start = row * cols + col
-    centre_x, centre_y = (col0 + 0.5) * resolution - x, (row0 + 0.5) * resolution - y
-    update = np.float32(free)
+    centre_x, centre_y = (col + col0 + 0.5) * resolution - x, (row + row0 + 0.5) * resolution - y
     scale = (table.shape[0] - 1) / (2 * reach)
+    if not (is_near(x, inverse_resolution, col0, cols) and is_near(y, inverse_resolution, row0, rows)):
+        return
     for i in range(ranges.shape[0]):
         z = float(ranges[i])
         kind = classify(z, range_min, range_max)
@@ -212,47 +261,39 @@ def add_log_odds(
         dx, dy = cos * u - sin * v, sin * u + cos * v
         end_col = cell(x + z * dx, inverse_resolution) - col0
         end_row = cell(y + z * dy, inverse_resolution) - row0
-        steps, tilt, major, minor = line(row, col, end_row, end_col, cols)
-        plain = last = steps
-        if kind == HIT:
-            along_x = major == 1 or major == -1
-            last = (
-                steps_to(x, col + col0, z + reach, dx, inverse_resolution)
-                if along_x
-                else steps_to(y, row + row0, z + reach, dy, inverse_resolution)
-            )
-            plain = int(steps * (1 - (reach + 1.25 * resolution) / z)) if z > reach else -1
-        first, last = clip(row, col, rows, cols, major, tilt, minor, last)
-        position = start + first * major
-        offset = first * tilt + HALF
-        plain = min(plain, last)
-        for _ in range(first, plain + 1):
-            flat[np.uintp(position + (offset >> SHIFT) * minor)] += update
-            position += major
-            offset += tilt
-        for _ in range(max(first, plain + 1), last + 1):
-            place = position + (offset >> SHIFT) * minor
-            cell_row = place // cols
-            distance = math.hypot((place - cell_row * cols) * resolution + centre_x, cell_row * resolution + centre_y)
-            flat[np.uintp(place)] += model(distance - z, free, reach, table, scale)
-            position += major
-            offset += tilt
+        steps, tilt, major, minor = line(end_row - row, end_col - col, cols, dx, dy)
+        last = steps
+        along_x = abs(major) == 1
+        if kind == HIT:  # walk on to the cell of the point at z + reach, at the same slope
+            beyond = (x + (z + reach) * dx) if along_x else (y + (z + reach) * dy)
+            last = abs(cell(beyond, inverse_resolution) - (col + col0 if along_x else row + row0))
+        first = 0
+        if not starts_inside or not inside(row, col, rows, cols, major, minor, tilt, last):
+            first, last = clip(row, col, rows, cols, major, minor, tilt, last)
+        plain = last
+        if kind == HIT:  # the centres of these cells lie more than the reach before the measured range
+            certain = z - reach - 1.25 * resolution
+            plain = min(last, int(steps * certain / z)) if certain > 0 and steps > 0 else -1
+        add_line(flat, table[0], start, first, plain, tilt, major, minor)
+        along, across = (centre_x, centre_y) if along_x else (centre_y, centre_x)
+        along_step = resolution if major > 0 else -resolution
+        across_step = resolution if minor > 0 else -resolution
+        for step in range(max(first, plain + 1), last + 1):
+            aside = (step * tilt + HALF) >> SHIFT
+            distance = math.sqrt((along + step * along_step) ** 2 + (across + aside * across_step) ** 2)
+            place = min(max((distance - z + reach) * scale, 0.0), table.shape[0] - 1.000001)
+            index = int(place)
+            odds = table[index] + np.float32(place - index) * (table[index + 1] - table[index])
+            flat[np.uintp(start + step * major + aside * minor)] += odds
 
 
 @inline
-def steps_to(origin: float, cell0: int, z: float, direction: float, inverse_resolution: float) -> int:
-    """Cells along one axis from the sensor's cell to the cell of the point at range z."""
-    return abs(cell(origin + z * direction, inverse_resolution) - cell0)
-
-
-@inline
-def model(d: float, free: float, reach: float, table: Any, scale: float) -> float:
-    """The inverse sensor model's log-odds at distance d behind the measured range, from its table."""
-    if d <= -reach:
-        return free
-    if d >= reach:
-        return 0.0
-    place = (d + reach) * scale
-    index = int(place)
-    share = place - index
-    return float(table[index] * (1 - share) + table[min(index + 1, table.shape[0] - 1)] * share)
+def inside(row: int, col: int, rows: int, cols: int, major: int, minor: int, tilt: int, last: int) -> bool:
+    """Whether a line's last step lies within the grid."""
+    along, aside = last, (last * tilt + HALF) >> SHIFT
+    if abs(major) == 1:
+        along, aside = aside, along
+        row, col = (row + along if minor > 0 else row - along), (col + aside if major > 0 else col - aside)
+    else:
+        row, col = (row + along if major > 0 else row - along), (col + aside if minor > 0 else col - aside)
+    return 0 <= row < rows and 0 <= col < cols

@@ -76,12 +76,12 @@ def test_long_lines_are_exact(end_row: int, end_col: int) -> None:
 @given(st.integers(1, 700_000), st.data())
 def test_fixed_point_offsets_are_exact(steps: int, data: st.DataObject) -> None:
     """floor(k m / n + 1/2) in rational numbers against the kernel's arithmetic, up to its stated limit."""
-    from mapping.rays import HALF, SHIFT
+    from mapping.rays import HALF, SHIFT, tilt_of
 
     minor, step = data.draw(st.integers(0, steps)), data.draw(st.integers(0, steps))
-    slope = ((minor << SHIFT) + steps - 1) // steps
+    tilt = tilt_of(minor, steps)
     exact = math.floor(Fraction(step * minor, steps) + Fraction(1, 2))
-    assert (step * slope + HALF) >> SHIFT == exact
+    assert (step * tilt + HALF) >> SHIFT == exact
 
 
 def test_a_ray_never_frees_the_cell_that_it_hits_nor_one_that_another_hits() -> None:
