@@ -13,6 +13,7 @@ demo: .venv/installed
 	@mkdir -p demo
 	$(BIN)/prim-record demo/session.mcap --seed $(SEED) --noise-std $(NOISE_STD)
 	cd demo && ../$(BIN)/prim-replay session.mcap --mapper det --quiet && ../$(BIN)/prim-replay session.mcap --mapper prob
+	@echo "look from here: $(BIN)/rerun demo/session.prob.rrd"
 	@$(BIN)/python docs/screenshot.py demo/session.prob.rrd demo/session.prob.png; case $$? in \
 	  0) echo "picture: demo/session.prob.png" ;; \
 	  4) echo "no picture: this machine cannot render (apt-get install mesa-vulkan-drivers)" ;; \

@@ -13,10 +13,13 @@ stand here.
 from __future__ import annotations
 
 import math
-from typing import Any
+from collections.abc import Callable
+from typing import Any, TypeVar
 
 import numpy as np
 from numba import njit
+
+Kernel = TypeVar("Kernel", bound=Callable[..., Any])
 
 BORDER_SLACK = 1e-3
 """A point this close below a cell's border (in cells) counts as on it.
@@ -34,8 +37,22 @@ MAX_STEPS = float(1 << 21)
 SKIPPED, HIT, NO_RETURN = 0, 1, 2
 FREE, OCCUPIED, UNSEEN = 0, 1, 2
 
-kernel = njit(cache=True, nogil=True, error_model="numpy", inline="never")
-inline = njit(cache=True, nogil=True, error_model="numpy", inline="always")
+
+def _compiled(**options: Any) -> Callable[[Kernel], Kernel]:
+    """Numba's compiler; its code is cached where there is a place that can be written."""
+
+    def compile_it(function: Kernel) -> Kernel:
+        try:
+            made: Kernel = njit(cache=True, nogil=True, error_model="numpy", **options)(function)
+        except RuntimeError:  # neither this folder nor the user's cache can be written
+            made = njit(nogil=True, error_model="numpy", **options)(function)
+        return made
+
+    return compile_it
+
+
+kernel = _compiled(inline="never")
+inline = _compiled(inline="always")
 
 
 @inline

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import sys
+import traceback
 from collections.abc import Sequence
 
 import typer
@@ -25,19 +26,25 @@ def run(app: typer.Typer, name: str, arguments: Sequence[str]) -> int:
         code = typer.main.get_command(app)(list(arguments), prog_name=name, standalone_mode=False)
         return _complain(name, "interrupted", INTERRUPTED) if code == INTERRUPTED else int(code or 0)
     except typer.TyperException as error:
-        return _complain(name, f"{error.format_message()} (try: {name} --help)", USAGE)
+        what = error.format_message().replace("Value error, ", "")
+        return _complain(name, f"{what} (try: {name} --help)", USAGE)
     except PrimError as error:
-        if debug:
-            raise
-        return _complain(name, str(error), error.exit_code)
+        return complain(name, error, debug)
     except BrokenPipeError:
         sys.stdout = open(os.devnull, "w", encoding="utf-8")  # noqa: PTH123, SIM115 - the reader has gone
         return 0
     except Exception as error:
         if debug:
-            raise
+            traceback.print_exc()
         what = f"unexpected {type(error).__name__}: {error}"
         return _complain(name, f"{what} (this is a bug: --debug shows the traceback)", FAILED)
+
+
+def complain(name: str, error: PrimError, debug: bool = False) -> int:
+    """Prints an expected error's one line (with ``debug`` its traceback before it); returns its exit code."""
+    if debug:
+        traceback.print_exception(error)
+    return _complain(name, str(error), error.exit_code)
 
 
 def _complain(name: str, what: str, code: int) -> int:

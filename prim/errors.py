@@ -38,7 +38,13 @@ class OutputError(PrimError):
 
     def __init__(self, path: str | Path, cause: OSError) -> None:
         self.path = str(path)
-        super().__init__(f"{path}: cannot write: {cause.strerror or cause}; choose another place with its option")
+        super().__init__(f"{path}: cannot write: {cause.strerror or cause}; choose another place")
+
+
+class InterruptedRecordingError(PrimError):
+    """A recording that was broken off, and where what was recorded until then lies."""
+
+    exit_code = 130
 
 
 class WorldError(PrimError):

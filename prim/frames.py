@@ -128,6 +128,16 @@ class Scan:
     scan_time: float = 0.0
 
     @property
+    def problem(self) -> str | None:
+        """What makes the whole scan unusable, None where nothing does."""
+        if not np.isfinite((self.angle_min, self.angle_increment, self.range_min)).all():
+            angles = f"angle_min {self.angle_min:g}, angle_increment {self.angle_increment:g}"
+            return f"{angles}, range_min {self.range_min:g}"
+        if not self.range_max > max(self.range_min, 0.0):
+            return f"range_max {self.range_max:g} is not above range_min {self.range_min:g} and 0"
+        return None
+
+    @property
     def directions(self) -> FloatArray:
         """Unit vectors (N, 2) of the beams in the laser's frame; shared and read-only."""
         return beam_directions(self.angle_min, self.angle_increment, len(self.ranges))

@@ -7,13 +7,14 @@ import os
 import struct
 import zlib
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Callable, Container, Iterator, Mapping
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import TracebackType
 from typing import IO, NamedTuple, TypeVar
 
+from mcap.data_stream import ReadDataStream
 from mcap.exceptions import EndOfFile, InvalidMagic, McapError, RecordLengthLimitExceeded
 from mcap.opcode import Opcode
 from mcap.reader import SeekingReader
@@ -23,7 +24,7 @@ from mcap.stream_reader import CRCValidationError, StreamReader, breakup_chunk
 from mcap.summary import Summary
 from mcap.writer import CompressionType, Writer
 
-from prim.errors import LogReadError, OutputError
+from prim.errors import InterruptedRecordingError, LogReadError, OutputError
 from prim.messages import message_definition
 
 MAGIC = b"\x89MCAP0\r\n"
@@ -73,18 +74,20 @@ class _Contents:
 class LogReader:
     """A log that is open for reading, message by message, in bounded memory.
 
-    An intact log is read by its index, in the order of log times. With ``recover`` a damaged one is read chunk
-    by chunk in file order, and what could not be read is told by :attr:`lost`. Raises LogReadError.
+    An intact log is read by its index, in the order of log times. With ``recover`` a damaged one is read chunk by
+    chunk, by its index where that is whole and else in file order, and what could not be read is told by
+    :attr:`lost`. Raises LogReadError.
     """
 
     def __init__(self, path: Path, recover: bool = False) -> None:
         self.path = resolve_log(path)
         self.recover = recover
         self.lost: list[str] = []
+        self._undecodable: set[tuple[str, int]] = set()
         self._file: IO[bytes] = _open(self.path)
         self._index = SeekingReader(self._file, validate_crcs=True, record_size_limit=RECORD_LIMIT)
         try:
-            self._summary = None if recover else self._read_summary()
+            self._summary = self._read_summary_or_none()
             self._contents = self._read_contents()
         except BaseException:
             self._file.close()
@@ -118,7 +121,7 @@ class LogReader:
         """An attachment's bytes, None where the log has none of that name. Raises LogReadError."""
         with _explained(self.path):
             if self._summary is None:
-                records = self._linear_records([])
+                records = self._records([])
                 found = (r for r in records if isinstance(r, Attachment) and r.name == name)
                 return next((record.data for record in found), None)
             for place in self._summary.attachment_indexes:
@@ -131,13 +134,10 @@ class LogReader:
         """How many messages of a damaged log could not be read; None where nothing says how many there were."""
         if not self.lost:
             return 0
-        try:
-            summary = self._read_summary()
-        except LogReadError:
+        if self._summary is None or self._summary.statistics is None:
             return None
-        if summary is None or summary.statistics is None:
-            return None
-        return summary.statistics.message_count - self._contents.counts.total()
+        unread = self._summary.statistics.message_count - self._contents.counts.total()
+        return unread + len(self._undecodable)
 
     def of_type(self, *types: str) -> list[Topic]:
         """The topics that carry messages of any of these types and are not empty, by name."""
@@ -161,6 +161,16 @@ class LogReader:
 
     def decoded(self, topic: Topic, decode: Callable[[bytes], Decoded]) -> Iterator[tuple[int, Decoded]]:
         """Log time (ns) and decoded message of one topic. Raises LogReadError on messages that do not decode."""
+        for _, log_time, decoded in self.numbered(topic, decode):
+            yield log_time, decoded
+
+    def numbered(
+        self, topic: Topic, decode: Callable[[bytes], Decoded], wanted: Container[int] | None = None
+    ) -> Iterator[tuple[int, int, Decoded]]:
+        """As :meth:`decoded`, with the number of each message on its topic; of those, only the ``wanted`` ones.
+
+        All of the topic is read even so: only its end shows whether messages are missing.
+        """
         if topic.encoding != "cdr":
             raise LogReadError(
                 self.path,
@@ -168,12 +178,23 @@ class LogReader:
                 "convert the log with: rosbags-convert --dst-storage mcap",
             )
         for index, message in enumerate(self.messages(topic.name)):
+            if wanted is not None and index not in wanted:
+                continue
             try:
                 decoded = decode(message.data)
             except ValueError as error:
-                where = f"message {index} of {topic.name}"
-                raise LogReadError(self.path, f"{where} cannot be decoded: {error}", _SALVAGE) from None
-            yield message.log_time, decoded
+                self._reject(topic, index, error)
+                continue
+            yield index, message.log_time, decoded
+
+    def _reject(self, topic: Topic, index: int, error: ValueError) -> None:
+        """Tells of a message that cannot be decoded: with ``recover`` a loss, else a LogReadError."""
+        if not self.recover:
+            what = f"message {index} of {topic.name} cannot be decoded: {error}"
+            raise LogReadError(self.path, what, "pass over such messages with --recover")
+        if not any(name == topic.name for name, _ in self._undecodable):
+            self.lost.append(f"messages of {topic.name} that cannot be decoded, the first one {index}: {error}")
+        self._undecodable.add((topic.name, index))
 
     def _read_summary(self) -> Summary | None:
         """The log's summary, its CRC checked; None where a complete log has none. Raises LogReadError."""
@@ -194,20 +215,39 @@ class LogReader:
         with _explained(self.path):
             return self._index.get_summary()
 
+    def _read_summary_or_none(self) -> Summary | None:
+        """A summary that says where everything is; None where there is none, or none that is whole to recover by."""
+        try:
+            summary = self._read_summary()
+        except LogReadError:
+            if not self.recover:
+                raise
+            return None
+        complete = summary is not None and summary.statistics is not None and summary.channels
+        return summary if complete else None
+
     def _read_contents(self) -> _Contents:
-        if self._summary is None or self._summary.statistics is None or not self._summary.channels:
+        if self.recover or self._summary is None:
             return self._scan_contents()
         with _explained(self.path):
             contents = _Contents(self._summary.channels, self._summary.schemas)
-            contents.counts.update(self._summary.statistics.channel_message_counts)
-            for index in self._summary.metadata_indexes:
-                metadata = _record_at(self._file, index.offset, Metadata)
-                contents.metadata[metadata.name] = metadata.metadata
+            if self._summary.statistics is not None:
+                contents.counts.update(self._summary.statistics.channel_message_counts)
+            contents.metadata.update(self._indexed_metadata(self._summary))
         return contents
+
+    def _indexed_metadata(self, summary: Summary) -> dict[str, Mapping[str, str]]:
+        records = (_record_at(self._file, index.offset, Metadata) for index in summary.metadata_indexes)
+        return {record.name: record.metadata for record in records}
 
     def _scan_contents(self) -> _Contents:
         contents = _Contents()
-        for record in self._linear_records(self.lost):
+        if self._summary is not None:
+            contents.channels.update(self._summary.channels)
+            contents.schemas.update(self._summary.schemas)
+            with suppress(LogReadError), _explained(self.path):
+                contents.metadata.update(self._indexed_metadata(self._summary))
+        for record in self._records(self.lost):
             if isinstance(record, Channel):
                 contents.channels[record.id] = record
             elif isinstance(record, Schema):
@@ -216,13 +256,31 @@ class LogReader:
                 contents.counts[record.channel_id] += 1
             elif isinstance(record, Metadata):
                 contents.metadata[record.name] = record.metadata
+        expected = self._summary.statistics if self._summary else None
+        if expected and not self.lost and contents.counts.total() < expected.message_count:
+            self.lost.append(f"{expected.message_count - contents.counts.total()} messages that the summary counts")
         return contents
 
     def _linear_messages(self, topics: tuple[str, ...]) -> Iterator[Message]:
         names = {number: channel.topic for number, channel in self._contents.channels.items()}
-        for record in self._linear_records([]):
+        for record in self._records([]):
             if isinstance(record, McapMessage) and names.get(record.channel_id) in topics:
                 yield Message(names[record.channel_id], record.log_time, record.data)
+
+    def _records(self, lost: list[str]) -> Iterator[McapRecord]:
+        """All records, by the index of chunks where there is one, else in file order."""
+        if self._summary is None or not self._summary.chunk_indexes:
+            yield from self._linear_records(lost)
+            return
+        for index in sorted(self._summary.chunk_indexes, key=lambda index: index.chunk_start_offset):
+            try:
+                with _explained(self.path):
+                    self._file.seek(index.chunk_start_offset + 1 + 8)
+                    chunk = Chunk.read(ReadDataStream(self._file))
+            except LogReadError as error:
+                lost.append(f"a chunk at byte {index.chunk_start_offset}: {error.what}")
+                continue
+            yield from self._chunk_records(chunk, lost)
 
     def _linear_records(self, lost: list[str]) -> Iterator[McapRecord]:
         """All records in file order; with ``recover`` damaged chunks are passed over and noted in ``lost``."""
@@ -252,7 +310,7 @@ class LogReader:
             if not self.recover:
                 raise
             seconds = (chunk.message_end_time - chunk.message_start_time) / 1e9
-            lost.append(f"a chunk of {seconds:.2f} s before byte {self._file.tell()}: {error.what}")
+            lost.append(f"a chunk of {seconds:.2f} s that ends at byte {self._file.tell()}: {error.what}")
             return []
 
 
@@ -310,6 +368,8 @@ class LogWriter:
                 self.part.replace(self.path)
         except OSError as failure:
             raise OutputError(self.path, failure) from failure
+        if isinstance(error, KeyboardInterrupt):
+            raise InterruptedRecordingError(f"interrupted: what was recorded until then is in {self.part}") from error
 
     def add_metadata(self, name: str, values: Mapping[str, str]) -> None:
         """Adds a metadata record; call it before the first message."""
@@ -413,4 +473,5 @@ def _explained(path: Path) -> Iterator[None]:
     except OSError as error:
         raise LogReadError(path, f"cannot be read: {error.strerror or error}", _SALVAGE) from error
     except Exception as error:  # struct.error, KeyError, ZstdError, UnicodeDecodeError, ...: the file is damaged
-        raise LogReadError(path, f"damaged: {error or type(error).__name__}", _SALVAGE) from error
+        what = f"damaged: its records do not fit together ({type(error).__name__}: {error})"
+        raise LogReadError(path, what, _SALVAGE) from error

@@ -213,12 +213,17 @@ def encode_primitives(stamp: int, world: World) -> bytes:
 
 
 def decode_primitives(data: bytes) -> tuple[int, tuple[Primitive, ...]]:
-    """Stamp (ns) and true primitives of a message of :func:`encode_primitives`. Raises ValueError."""
+    """Stamp (ns) and true primitives of a message of :func:`encode_primitives`; stamp 0 if it is empty.
+
+    Raises ValueError.
+    """
     markers = decode_message(MARKERS_TYPE, data).markers
     primitives = []
     for marker in markers:
         if marker.ns == "primitives":
             truth = json.loads(marker.text)
+            if not isinstance(truth, dict):
+                raise ValueError(f"a marker's text is no object: {marker.text}")
             pose = _stamped(marker.header, "", marker.pose.position, marker.pose.orientation)
             turn = planar(pose)
             primitives.append(

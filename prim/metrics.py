@@ -85,7 +85,7 @@ def polygon_iou(a: Primitive, b: Primitive) -> float:
 def match_primitives(detections: Sequence[Primitive], truth: Sequence[Primitive]) -> list[Pair]:
     """Pairs of overlapping detections and true primitives, each used once, best first.
 
-    Pairs of the same kind go before pairs of different kinds, larger IoU before smaller. True primitives do
+    Finds go before other pairs, and larger IoU before smaller. True primitives do
     not overlap, so that no detection overlaps two of them by half and this greedy order finds as many as any.
     """
     candidates = [

@@ -175,6 +175,8 @@ class Primitive:
     @classmethod
     def from_json(cls, value: Mapping[str, Any]) -> Primitive:
         """The inverse of :meth:`to_json`. Raises ValueError that names what is wrong."""
+        if not isinstance(value, Mapping):
+            raise ValueError(f"{json.dumps(value)} does not describe a primitive")
         try:
             kind = Kind(value["kind"])
             size = value["size"]

@@ -61,8 +61,8 @@ class World:
         if not isinstance(value, Mapping) or "size" not in value:
             raise ValueError("a world is an object with 'size', 'primitives' and 'walls'")
         size = _numbers(value["size"], 2, "size")
-        walls = tuple(_numbers(wall, 4, "a wall") for wall in value.get("walls", ()))
-        primitives = tuple(Primitive.from_json(item).canonical() for item in value.get("primitives", ()))
+        walls = tuple(_numbers(wall, 4, "a wall") for wall in _listed(value, "walls"))
+        primitives = tuple(Primitive.from_json(item).canonical() for item in _listed(value, "primitives"))
         if min(size) <= 0:
             raise ValueError(f"size {list(size)} is not positive")
         return cls((size[0], size[1]), primitives, tuple((a, b, c, d) for a, b, c, d in walls))
@@ -72,16 +72,28 @@ class World:
         """Reads a world from a JSON file. Raises WorldError."""
         try:
             return cls.from_json(json.loads(path.read_text(encoding="utf-8")))
+        except (UnicodeDecodeError, json.JSONDecodeError) as error:
+            raise WorldError(f"{path}: not a world: not a JSON file: {error}") from error
         except OSError as error:
             raise WorldError(f"{path}: cannot read the world: {error.strerror}") from error
-        except (ValueError, TypeError, AttributeError) as error:
+        except ValueError as error:
             raise WorldError(f"{path}: not a world: {error}") from error
+
+
+def _listed(value: Mapping[str, Any], key: str) -> list[Any]:
+    items = value.get(key, [])
+    if not isinstance(items, list):
+        raise ValueError(f"{key} is a list, not {json.dumps(items)}")
+    return items
 
 
 def _numbers(value: Any, count: int, what: str) -> tuple[float, ...]:
     if not isinstance(value, Sequence) or isinstance(value, str) or len(value) != count:
         raise ValueError(f"{what} is {count} numbers, not {json.dumps(value)}")
-    numbers = tuple(float(number) for number in value)
+    try:
+        numbers = tuple(float(number) for number in value)
+    except TypeError:
+        raise ValueError(f"{what} is {count} numbers, not {json.dumps(value)}") from None
     if not all(math.isfinite(number) for number in numbers):
         raise ValueError(f"{what} has a number that is not finite: {numbers}")
     return numbers

@@ -79,12 +79,19 @@ def record(
     from recorder.session import record as record_session
     from recorder.world import WorldOptions
 
+    drawn = (size, walls, kinds, per_kind) != ((2.0, 2.0), True, KINDS, "0-2")
+    if world is not None and drawn:
+        raise UsageError("--world excludes --size, --no-walls, --kinds and --per-kind: the file says it all")
     _check_positive(
         {"--size": min(size), "--rate": rate, "--fov": fov, "--range-max": range_max, "--stops": min(stops)}
     )
     _check_not_negative({"--range-min": range_min, "--gps-noise": gps_noise, "--compass-noise": compass_noise})
     if range_min >= range_max:
         raise UsageError(f"--range-min {range_min:g} is not below --range-max {range_max:g}")
+    if not 1e-3 <= rate <= 1e6:
+        raise UsageError(f"--rate is {rate:g}: it must be from 0.001 to 1000000 scans per second")
+    if max(range_max, *size) > 1e6:
+        raise UsageError("--range-max and --size must not be above 1000000 m")
     if fov > 360:
         raise UsageError(f"--fov {fov:g} is more than a full turn of 360 degrees")
     options = SessionOptions(
@@ -115,7 +122,8 @@ def _kinds(text: str) -> tuple[Kind, ...]:
     names = [name.strip() for name in text.split(",") if name.strip()]
     unknown = [name for name in names if name not in KINDS.split(",")]
     if unknown or not names:
-        raise UsageError(f"--kinds {text!r}: {unknown or 'nothing'} named; there are {KINDS}")
+        what = f"{', '.join(unknown)} is no kind" if unknown else "it names no kind"
+        raise UsageError(f"--kinds {text}: {what}; the kinds are {KINDS}")
     return tuple(Kind(name) for name in names)
 
 
@@ -154,7 +162,7 @@ def _check_not_negative(values: dict[str, float]) -> None:
 def _summary(session: Session, options: SessionOptions) -> str:
     counts = Counter(str(primitive.kind) for primitive in session.world.primitives)
     what = ", ".join(f"{count} {kind}{'s' * (count > 1)}" for kind, count in counts.items()) or "no primitives"
-    skipped = f" ({session.skipped} stops skipped, in a primitive's way)" if session.skipped else ""
+    skipped = f" ({session.skipped} stops skipped: something stands there)" if session.skipped else ""
     return (
         f"{session.path}: {session.scans} scans of {options.lidar.rays} rays{skipped}, "
         f"noise {options.lidar.noise_std * 1000:g} mm, {what}\nreplay it: prim-replay {session.path}"

@@ -143,5 +143,6 @@ def _write_sensors(log: LogWriter, stamp: int, pose: Pose2D, options: SessionOpt
 def _describe(options: SessionOptions) -> dict[str, str]:
     """The recording options as metadata: SI units, JSON values."""
     described = asdict(options)
-    described["world_file"] = options.world_file.name if options.world_file else None
+    if options.world_file:
+        described |= {"world_file": options.world_file.name, "world": None}
     return {"version": __version__} | {name: json.dumps(value) for name, value in described.items()}

@@ -10,13 +10,14 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from enum import StrEnum
+from itertools import takewhile
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from prim import __version__, console
-from prim.errors import UsageError
+from prim.errors import PrimError, UsageError
 
 if TYPE_CHECKING:
     from prim.world import Bounds
@@ -72,6 +73,12 @@ def replay(
         tuple[float, float, float] | None,
         typer.Option(metavar="X Y DEG", help="Where the laser is mounted on the robot."),
     ] = None,
+    max_range: Annotated[
+        float | None,
+        typer.Option(
+            metavar="M", help="Follow beams no further than this, metres. [default: the scanner's range_max]"
+        ),
+    ] = None,
     standing_still: Annotated[
         bool, typer.Option("--standing-still", help="The robot does not move: map without poses.")
     ] = False,
@@ -109,11 +116,12 @@ def replay(
     from replay.scans import Selection
     from replay.show import ViewerOptions
 
-    outputs = Outputs(save, report, map_output, trajectory)
-    outputs.check(len(logs))
     shown = ViewerOptions(save, spawn, connect, serve, live=rate is not None)
-    if no_viewer and shown != ViewerOptions(live=shown.live):
-        raise UsageError("--no-viewer excludes --save, --spawn, --connect and --serve")
+    if no_viewer and (shown != ViewerOptions(live=shown.live) or map_every):
+        raise UsageError("--no-viewer excludes --save, --spawn, --connect, --serve and --map-every")
+    given = Outputs(save, report, map_output, trajectory)
+    jobs = {log: given.named_after(log, mapper.value, not (no_viewer or shown.watched)) for log in logs}
+    check_apart(logs, list(jobs.values()))
     offset = Pose2D(laser_offset[0], laser_offset[1], math.radians(laser_offset[2])) if laser_offset else None
     options = ReplayOptions(
         mapper=mapper.value,
@@ -123,6 +131,7 @@ def replay(
         scan_topic=scan_topic,
         odom_topic=odom_topic,
         laser_offset=offset,
+        max_range=max_range,
         standing_still=standing_still,
         selection=Selection(start, end, duration, n_scans, stride),
         rate=rate,
@@ -130,11 +139,15 @@ def replay(
         recover=recover,
     )
     codes = []
-    for log in logs:
-        named = outputs.named_after(log, mapper.value, with_recording=not (no_viewer or shown.watched))
-        viewer = None if no_viewer else dataclasses.replace(shown, save=named.recording)
-        codes.append(_replay_log(log, options, named, viewer, Talk(quiet, verbose)))
-    return max(codes)
+    for log, outputs in jobs.items():
+        viewer = None if no_viewer else dataclasses.replace(shown, save=outputs.recording)
+        try:
+            codes.append(_replay_log(log, options, outputs, viewer, Talk(quiet, verbose)))
+        except PrimError as error:
+            if len(jobs) == 1:
+                raise
+            codes.append(console.complain("prim-replay", error, debug))
+    return next((code for code in (console.FAILED, console.USAGE, PARTLY_LOST) if code in codes), 0)
 
 
 @dataclass(frozen=True)
@@ -147,21 +160,31 @@ class Outputs:
     trajectory: Path | None
 
     @property
-    def named(self) -> list[Path]:
-        """Those that have a name."""
-        return [path for path in dataclasses.astuple(self) if path is not None]
+    def files(self) -> list[Path]:
+        """All the files."""
+        from replay.report import map_files
 
-    def check(self, logs: int) -> None:
-        """Raises UsageError where several logs would write one file."""
-        if logs > 1 and self.named:
-            path = self.named[0]
-            raise UsageError(f"{logs} logs cannot all write {path}: replay them one by one to name their outputs")
+        one_file = (self.recording, self.report, self.trajectory)
+        return [path for path in one_file if path] + (list(map_files(self.map)) if self.map else [])
 
     def named_after(self, log: Path, mapper: str, with_recording: bool) -> Outputs:
         """Those of one log: what is not named gets a name in this folder."""
         stem = f"{log.resolve().name.removesuffix('.part').removesuffix('.mcap')}.{mapper}"
         recording = self.recording or (Path(f"{stem}.rrd") if with_recording else None)
         return dataclasses.replace(self, recording=recording, report=self.report or Path(f"{stem}.report.json"))
+
+
+def check_apart(logs: Sequence[Path], jobs: Sequence[Outputs]) -> None:
+    """Raises UsageError where a file would be written twice, or over a log."""
+    files = [path.resolve() for outputs in jobs for path in outputs.files]
+    inputs = {log.resolve() for log in logs}
+    if len(inputs) < len(logs):
+        raise UsageError("a log is named twice")
+    for path in files:
+        if path in inputs:
+            raise UsageError(f"{path} is a log: it cannot be an output as well")
+        if files.count(path) > 1:
+            raise UsageError(f"{path} would be written twice: name the outputs, or replay the logs one by one")
 
 
 @dataclass(frozen=True)
@@ -177,7 +200,7 @@ def _replay_log(log: Path, options: ReplayOptions, outputs: Outputs, shown: View
     from replay.pipeline import Pipeline
     from replay.report import check_writable, write_map, write_report, write_trajectory
 
-    for path in outputs.named:
+    for path in outputs.files:
         check_writable(path)
     viewer = _make_viewer(shown)
     with _progress_bar(talk.quiet) as progress:
@@ -221,6 +244,7 @@ def _progress_bar(quiet: bool) -> Iterator[Progress | None]:
 def _print_result(result: ReplayResult, outputs: Outputs, verbose: bool) -> None:
     from rich.console import Console
     from rich.table import Table
+    from rich.text import Text
 
     from replay.report import table
 
@@ -228,13 +252,13 @@ def _print_result(result: ReplayResult, outputs: Outputs, verbose: bool) -> None
         typer.echo(f"note: {note}", err=True)
     rows = Table(show_header=False, box=None, pad_edge=False)
     for name, value in table(result):
-        rows.add_row(name, value)
+        rows.add_row(Text(name), Text(value))
     if verbose:
         for name, seconds in result.seconds.items():
-            rows.add_row(name, f"{seconds:.3f} s")
+            if seconds:
+                rows.add_row(Text(f"  {name}"), Text(f"{seconds:.3f} s"))
     Console(highlight=False, soft_wrap=True).print(rows)
-    written = [path for path in (outputs.report, outputs.map, outputs.trajectory) if path]
-    typer.echo("wrote: " + ", ".join(str(path) for path in written))
+    typer.echo("wrote: " + ", ".join(str(path) for path in outputs.files))
     if outputs.recording:
         typer.echo(f"look:  rerun {outputs.recording}")
 
@@ -247,13 +271,12 @@ def _keep_serving() -> None:
 
 
 def join_bounds(arguments: Sequence[str]) -> list[str]:
-    """Makes the four numbers after ``--bounds`` one argument, since an option takes a fixed number of them."""
+    """Makes the numbers after ``--bounds`` one argument, since an option takes a fixed number of them."""
     joined = list(arguments)
     if "--bounds" in joined:
         at = joined.index("--bounds") + 1
-        numbers = joined[at : at + 4]
-        if len(numbers) == 4 and all(_is_number(number) for number in numbers):
-            joined[at : at + 4] = [" ".join(numbers)]
+        numbers = list(takewhile(_is_number, joined[at : at + 4]))
+        joined[at : at + len(numbers)] = [" ".join(numbers)] if numbers else []
     return joined
 
 

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections import defaultdict
+from collections import Counter, defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from functools import partial
+from functools import cached_property, partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,6 +18,7 @@ from prim.messages import (
     MAP_FRAME,
     ODOM_FRAME,
     ODOMETRY_TYPE,
+    POSE_DECODERS,
     POSE_TYPE,
     POSE_WITH_COVARIANCE_TYPE,
     TF_TYPE,
@@ -30,6 +31,12 @@ from prim.shapes import FloatArray
 
 SOURCES = ("auto", "truth", "tf", "odom")
 STILL = "still"
+
+ROOTS = (MAP_FRAME, ODOM_FRAME)
+"""Frames that stand still, the best first."""
+
+MAX_GAP = 1.0
+"""Poses further apart (s) than this are interpolated over a gap, which is said."""
 
 MAX_TILT = 0.97
 """Below this cosine a laser's plane counts as tilted, and its scans as no horizontal section (14 degrees)."""
@@ -89,6 +96,7 @@ class TransformTree:
     """The tf tree of a log: each frame's parent and where the frame stands in it over time."""
 
     edges: dict[str, tuple[str, Transforms]] = field(default_factory=dict)
+    disputed: list[tuple[str, str]] = field(default_factory=list)
 
     @classmethod
     def read(cls, log: LogReader) -> TransformTree:
@@ -103,10 +111,12 @@ class TransformTree:
                     if topic.name.endswith("tf_static"):
                         static.add(edge)
         tree = cls()
-        for edge, poses in sorted(found.items(), key=lambda item: len(item[1])):
-            usable = [pose for pose in poses if _usable(pose)]
-            if usable:  # of two parents, the one with more transforms comes last and stays
-                tree.edges[edge[1]] = edge[0], _transforms(usable, edge in static or len(usable) == 1)
+        usable = {edge: kept for edge, poses in found.items() if (kept := [p for p in poses if _usable(p)])}
+        parents = Counter(child for _, child in usable)
+        # of several parents the last one stays: map or odom, else the one with the most transforms
+        for edge, poses in sorted(usable.items(), key=lambda item: (item[0][0] in ROOTS, len(item[1]))):
+            tree.edges[edge[1]] = edge[0], _transforms(poses, edge in static or len(poses) == 1)
+        tree.disputed = [(child, tree.edges[child][0]) for child, count in parents.items() if count > 1]
         return tree
 
     def chain(self, frame: str) -> list[str]:
@@ -136,7 +146,16 @@ class Localizer:
         self._log = log
         self._odom_topic = odom_topic
         self._offset = laser_offset
-        self._tree = TransformTree.read(log)
+        self._tree_notes: tuple[str, ...] = ()
+
+    @cached_property
+    def _tree(self) -> TransformTree:
+        """The log's tf tree; an empty one, and a note, where it cannot be read."""
+        try:
+            return TransformTree.read(self._log)
+        except LogReadError as error:
+            self._tree_notes = (f"tf is not used: {error.what}",)
+            return TransformTree()
 
     def locate(self, scans: ScanTimes, source: str = "auto") -> LaserPoses:
         """The laser's pose at every scan, from ``source`` or, with ``auto``, from the best there is.
@@ -149,18 +168,25 @@ class Localizer:
         return found
 
     def _find(self, scans: ScanTimes, source: str) -> LaserPoses:
-        if source == "truth" or (source == "auto" and self._has(TRUE_POSE_TOPIC)):
+        if source == "auto" and self._odom_topic is not None:
+            source = "odom"
+        if source == "truth" or (source == "auto" and self.has_truth):
             return self._from_truth(scans)
+        if source == "odom":
+            return self._from_odometry(scans, source)
         chain = self._fixed_chain(scans.frame_id)
-        if source == "tf" or (source == "auto" and len(chain) > 1 and not self._odom_topic):
+        if source == "tf" or len(chain) > 1:
             return self._from_tf(scans, chain)
         return self._from_odometry(scans, source)
 
-    def _has(self, topic: str) -> bool:
-        return topic in self._log.topics and self._log.topics[topic].messages > 0
+    @property
+    def has_truth(self) -> bool:
+        """Whether the log has true poses."""
+        topic = self._log.topics.get(TRUE_POSE_TOPIC)
+        return topic is not None and topic.messages > 0 and topic.type == POSE_TYPE
 
     def _from_truth(self, scans: ScanTimes) -> LaserPoses:
-        if not self._has(TRUE_POSE_TOPIC):
+        if not self.has_truth:
             raise LogReadError(
                 self._log.path, f"no ground truth: there is no {TRUE_POSE_TOPIC}", "give another --pose"
             )
@@ -173,7 +199,9 @@ class Localizer:
             raise LogReadError(
                 self._log.path,
                 f"no poses for frame {scans.frame_id!r}: {everything}no Odometry or PoseStamped",
-                "to map it with the robot at rest give --standing-still",
+                "; ".join(
+                    [*self._tree_notes, *self._log.lost, "to map with the robot at rest give --standing-still"]
+                ),
             )
         return self._from_topic(scans, topic, "odom")
 
@@ -184,7 +212,8 @@ class Localizer:
         if self._odom_topic is not None:
             chosen = [topic for topic in topics if topic.name == self._odom_topic]
             if not chosen:
-                what = f"no poses on {self._odom_topic}"
+                there = self._log.topics.get(self._odom_topic)
+                what = f"no {'messages' if there and there.type in POSE_DECODERS else 'poses'} on {self._odom_topic}"
                 raise LogReadError(self._log.path, what, f"topics with poses: {names}")
             return chosen[0]
         odometry = [topic for topic in topics if topic.type == ODOMETRY_TYPE] or topics
@@ -213,43 +242,50 @@ class Localizer:
                     unusable += 1
         if not stamps:
             raise LogReadError(self._log.path, f"{topic.name} has no usable pose", "give another --pose")
-        at, valid = Trajectory.from_unsorted(stamps, poses).at(scans.stamps)
-        mount, upside_down, notes = self._mount(scans, base or BASE_FRAME)
+        trajectory = Trajectory.from_unsorted(stamps, poses)
+        at, valid = trajectory.at(scans.stamps)
+        mounts, upside_down, notes = self._mount(scans, base or BASE_FRAME)
+        notes += _gap_note(topic.name, trajectory.stamps, scans.stamps)
         if unusable:
-            notes = (
-                *notes,
-                f"{topic.name}: {unusable} poses that are not finite or have no rotation were skipped",
-            )
-        return LaserPoses(source, topic.name, _compose(at, mount), valid, upside_down, notes)
+            notes += (f"{topic.name}: {unusable} poses that are not finite or have no rotation were skipped",)
+        return LaserPoses(source, topic.name, _compose(at, mounts), valid, upside_down, notes)
 
-    def _mount(self, scans: ScanTimes, base: str) -> tuple[Pose2D, bool, tuple[str, ...]]:
-        """Where the laser stands on the robot, whether upside down, and what had to be assumed."""
+    def stand_still(self, scans: ScanTimes) -> LaserPoses:
+        """A robot at the map's origin all the time, its laser where the offset or tf puts it."""
+        mounts, upside_down, _ = self._mount(scans, BASE_FRAME)
+        valid = np.ones(len(scans.stamps), dtype=bool)
+        return LaserPoses(STILL, "standing still", mounts, valid, upside_down)
+
+    def _mount(self, scans: ScanTimes, base: str) -> tuple[FloatArray, bool, tuple[str, ...]]:
+        """Where the laser stands on the robot at every scan, whether upside down, and what had to be assumed."""
         frame = scans.frame_id.lstrip("/")
-        if self._offset is not None:
-            return self._offset, False, ()
-        if frame == base:
-            return Pose2D(), False, ()
         chain = self._tree.chain(frame)
-        if base not in chain:
-            note = (
-                f"no transform from {base} to {frame}: the laser is taken to be at the robot's origin; "
-                "if it is not, give --laser-offset X Y DEG"
+        chain = chain[: chain.index(base) + 1] if base in chain else chain[:1]
+        rotation, translation, _ = self._tree.lookup(chain, scans.stamps)
+        mounts, upside_down, notes = _flatten(rotation, translation)
+        notes += self._tree_notes
+        if self._offset is not None:
+            mounts[:] = self._offset.x, self._offset.y, self._offset.theta
+            notes += (f"--laser-offset stands in for the transform from {base} to {frame}",) * (len(chain) > 1)
+        elif frame != base and len(chain) == 1:
+            notes += (
+                f"no transform from {base} to {frame or 'the scans, which name no frame'}: the laser is taken to be "
+                "at the robot's origin; if it is not, give --laser-offset X Y DEG",
             )
-            return Pose2D(), False, (note,)
-        rotation, translation, _ = self._tree.lookup(chain[: chain.index(base) + 1], scans.stamps[:1])
-        poses, upside_down, notes = _flatten(rotation, translation)
-        return Pose2D(*poses[0].tolist()), upside_down, notes
+        return mounts, upside_down, notes
 
     def _fixed_chain(self, frame: str) -> list[str]:
         """The tf chain from ``frame`` to ``map``, else ``odom``, else its moving root; the frame alone if none."""
         chain = self._tree.chain(frame)
-        for root in (MAP_FRAME, ODOM_FRAME):
+        for root in ROOTS:
             if root in chain:
                 return chain[: chain.index(root) + 1]
         moving = any(not self._tree.edges[link][1].static for link in chain[:-1])
         return chain if moving else chain[:1]
 
     def _from_tf(self, scans: ScanTimes, chain: list[str]) -> LaserPoses:
+        if len(chain) < 2 and self._tree_notes:
+            raise LogReadError(self._log.path, *self._tree_notes)
         if len(chain) < 2:
             frames = ", ".join(sorted({*self._tree.edges, *(parent for parent, _ in self._tree.edges.values())}))
             raise LogReadError(
@@ -259,9 +295,15 @@ class Localizer:
             )
         rotation, translation, valid = self._tree.lookup(chain, scans.stamps)
         poses, upside_down, notes = _flatten(rotation, translation)
+        for frame in chain[:-1]:
+            parent, edge = self._tree.edges[frame]
+            if not edge.static:
+                notes += _gap_note(f"tf from {parent} to {frame}", edge.stamps, scans.stamps)
+        notes += tuple(
+            f"{frame} has several parents in tf: {parent} is used" for frame, parent in self._tree.disputed
+        )
         if self._offset is not None:
-            note = "--laser-offset is not used: tf says where the laser is"
-            notes = (*notes, note)
+            notes += ("--laser-offset is not used: tf says where the laser is",)
         return LaserPoses("tf", " > ".join(reversed(chain)), poses, valid, upside_down, notes)
 
     def _no_overlap(self, scans: ScanTimes, found: LaserPoses) -> tuple[str, str]:
@@ -270,19 +312,26 @@ class Localizer:
         return what, "two clocks in one log? give another --pose or --odom-topic"
 
 
-def standing_still(scans: ScanTimes, laser_offset: Pose2D | None) -> LaserPoses:
-    """A robot at the map's origin all the time."""
-    offset = laser_offset or Pose2D()
-    poses = np.tile([offset.x, offset.y, offset.theta], (len(scans.stamps), 1))
-    return LaserPoses(STILL, "standing still", poses, np.ones(len(scans.stamps), dtype=bool))
+def _gap_note(what: str, poses: Stamps, scans: Stamps) -> tuple[str, ...]:
+    """A note where scans (stamps in ns) lie between poses that are far apart in time."""
+    after = np.clip(np.searchsorted(poses, scans), 1, max(len(poses) - 1, 1))
+    if len(poses) < 2:
+        return ()
+    inside = (scans > poses[after - 1]) & (scans < poses[after])
+    gaps = np.where(inside, poses[after] - poses[after - 1], 0) / 1e9
+    wide = int(np.count_nonzero(gaps > MAX_GAP))
+    if not wide:
+        return ()
+    scans_lie = "1 scan lies" if wide == 1 else f"{wide} scans lie"
+    return (f"{what}: {scans_lie} in a gap of up to {gaps.max():.1f} s between poses, and are placed in between",)
 
 
-def _compose(poses: FloatArray, mount: Pose2D) -> FloatArray:
-    """Poses (N, 3) of a frame that is mounted at ``mount`` on frames at ``poses``."""
+def _compose(poses: FloatArray, mounts: FloatArray) -> FloatArray:
+    """Poses (N, 3) of frames that are mounted at ``mounts`` (N, 3) on frames at ``poses`` (N, 3)."""
     cos, sin = np.cos(poses[:, 2]), np.sin(poses[:, 2])
-    x = poses[:, 0] + cos * mount.x - sin * mount.y
-    y = poses[:, 1] + sin * mount.x + cos * mount.y
-    return np.column_stack((x, y, poses[:, 2] + mount.theta))
+    x = poses[:, 0] + cos * mounts[:, 0] - sin * mounts[:, 1]
+    y = poses[:, 1] + sin * mounts[:, 0] + cos * mounts[:, 1]
+    return np.column_stack((x, y, poses[:, 2] + mounts[:, 2]))
 
 
 def _flatten(rotation: FloatArray, translation: FloatArray) -> tuple[FloatArray, bool, tuple[str, ...]]:
@@ -304,7 +353,7 @@ def _transforms(poses: Sequence[StampedPose], static: bool) -> Transforms:
     """Transforms sorted by stamp; of several with one stamp the last; of static ones the last alone."""
     if static:
         poses = poses[-1:]
-    by_stamp = dict(sorted((pose.stamp, pose) for pose in poses))
+    by_stamp = {pose.stamp: pose for pose in sorted(poses, key=lambda pose: pose.stamp)}
     rotations = np.array([pose.rotation for pose in by_stamp.values()])
     return Transforms(
         np.array(list(by_stamp), dtype=np.int64),

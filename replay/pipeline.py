@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -21,13 +21,19 @@ from prim.log import LogReader
 from prim.metrics import MapScores, pose_rmse
 from prim.shapes import angle_difference
 from prim.world import Bounds
-from replay.localize import STILL, LaserPoses, Localizer, standing_still
-from replay.scans import ScanLog, Selection, turned_over
+from replay.localize import STILL, LaserPoses, Localizer
+from replay.scans import ScanLog, Selection, counted, turned_over
 from replay.show import NullViewer, Scene, Viewer
 from replay.truth import Truth
 
 WORLD_MARGIN = 0.1
 """Automatic bounds reach this far (m) beyond the recorded world."""
+
+MAX_OFFSET = 1000.0
+"""No laser stands further (m) from its robot's origin."""
+
+MAX_WAIT = 10.0
+"""A replay at a rate waits no longer (s) for the next scan, however long the log paused."""
 
 MAP_FRAMES = 50
 MAP_FRAME_CELLS = 40_000_000
@@ -47,6 +53,7 @@ class ReplayOptions:
     scan_topic: str | None = None
     odom_topic: str | None = None
     laser_offset: Pose2D | None = None
+    max_range: float | None = None
     standing_still: bool = False
     selection: Selection = field(default_factory=Selection)
     rate: float | None = None
@@ -60,10 +67,17 @@ class ReplayOptions:
             raise UsageError("--bounds X0 Y0 X1 Y1: X0 must be below X1 and Y0 below Y1")
         if self.rate is not None and not (0 < self.rate < np.inf):
             raise UsageError(f"--rate is {self.rate:g}: it must be above 0")
+        if self.max_range is not None and not self.max_range > 0:
+            raise UsageError(f"--max-range is {self.max_range:g}: it must be above 0")
         if self.map_every is not None and self.map_every < 1:
             raise UsageError(f"--map-every is {self.map_every}: it must be at least 1")
-        if self.standing_still and self.pose != "auto":
-            raise UsageError(f"--standing-still and --pose {self.pose} exclude each other")
+        if self.standing_still and (self.pose != "auto" or self.odom_topic):
+            raise UsageError("--standing-still excludes --pose and --odom-topic")
+        if self.odom_topic and self.pose not in ("auto", "odom"):
+            raise UsageError(f"--odom-topic goes with --pose odom, not with --pose {self.pose}")
+        offset = self.laser_offset
+        if offset is not None and not (np.abs((offset.x, offset.y, offset.theta)) < MAX_OFFSET).all():
+            raise UsageError(f"--laser-offset is {offset.x:g} {offset.y:g}: it must be metres on a robot")
 
 
 @dataclass(frozen=True)
@@ -85,6 +99,21 @@ class ReplayResult:
     grid: OccupancyGrid
     scores: MapScores | None
     seconds: dict[str, float]
+
+
+@dataclass
+class Used:
+    """How much of a log went into the map."""
+
+    scans: int = 0
+    rays: int = 0
+    hits: int = 0
+
+    def count(self, scan: Scan) -> None:
+        """Adds a scan."""
+        self.scans += 1
+        self.rays += len(scan.ranges)
+        self.hits += int(np.count_nonzero(scan.hits))
 
 
 class Clock:
@@ -123,44 +152,67 @@ class Pipeline:
         self.viewer: Viewer = viewer or NullViewer()
         self._progress = progress or (lambda done, total: None)
         self._clock = Clock()
+        self._notes: list[str] = []
 
     def run(self) -> ReplayResult:
         """The whole replay. Raises LogReadError, UsageError, OutputError."""
+        try:
+            return self._run()
+        except BaseException:
+            self.viewer.abandon()
+            raise
+
+    def _run(self) -> ReplayResult:
         with LogReader(self.path, recover=self.options.recover) as log:
             with self._clock.stage("read"):
                 scans = ScanLog(log, self.options.scan_topic, self.options.selection)
-                truth = Truth.read(log)
+                truth = self._read_truth(log)
             with self._clock.stage("localize"):
-                poses, true_poses = self._localize(log, scans, truth)
+                poses, true_poses = self._localize(log, scans)
             frame = self._frame(scans, poses, truth)
             mapper = make_mapper(self.options.mapper, self.options.resolution, frame.bounds)
             judge = Judge(frame, truth, poses, true_poses)
             world = truth.world if truth else None
             scene = Scene(log.path.name, self.options.mapper, frame.bounds, world, judge.compares_poses)
             self._begin(log, scans, poses, scene)
-            rays = self._map_scans(scans, poses, mapper, judge, self._map_every(len(scans), frame))
+            used = self._map_scans(scans, poses, mapper, judge, self._map_every(len(scans), frame))
             with self._clock.stage("map"):
                 grid = mapper.finish()
             scores = judge.score(grid)
-            result = self._result(log, scans, poses, rays, grid, scores, judge)
+            self._note_what_was_used(scans, poses, used, grid)
+            result = self._result(log, scans, poses, used, grid, scores, judge)
             with self._clock.stage("viewer"):
                 last = len(scans) - 1
-                self.viewer.show_map(last, int(scans.stamps[last]), grid, scores)
+                stamp = int(scans.stamps[last])
+                for note in result.notes:
+                    self.viewer.event(last, stamp, note, warning=True)
+                self.viewer.show_map(last, stamp, grid, scores)
                 self.viewer.finish(result)
         return result
 
-    def _localize(self, log: LogReader, scans: ScanLog, truth: Truth | None) -> tuple[LaserPoses, LaserPoses | None]:
-        """The laser's poses, and the true ones where the log has both them and a true world."""
+    def _read_truth(self, log: LogReader) -> Truth | None:
+        """The log's true world; a note where it has one that cannot be understood."""
+        try:
+            return Truth.read(log)
+        except LogReadError as error:
+            self._notes.append(f"the map is not scored: {error.what}")
+            return None
+
+    def _localize(self, log: LogReader, scans: ScanLog) -> tuple[LaserPoses, LaserPoses | None]:
+        """The laser's poses, and the true ones where the log has them."""
         options = self.options
-        if options.standing_still:
-            return standing_still(scans.times, options.laser_offset), None
         localizer = Localizer(log, options.odom_topic, options.laser_offset)
+        if options.standing_still:
+            return localizer.stand_still(scans.times), None
         poses = localizer.locate(scans.times, options.pose)
-        if truth is None:
+        if poses.source == "truth":
+            return poses, poses
+        if not localizer.has_truth:
             return poses, None
         try:
-            return poses, poses if poses.source == "truth" else localizer.locate(scans.times, "truth")
-        except LogReadError:
+            return poses, localizer.locate(scans.times, "truth")
+        except LogReadError as error:
+            self._notes.append(f"the poses are not held against the truth: {error.what}")
             return poses, None
 
     def _frame(self, scans: ScanLog, poses: LaserPoses, truth: Truth | None) -> GridFrame:
@@ -197,35 +249,49 @@ class Pipeline:
             position, scan = item
             if poses.valid[position]:
                 pose = Pose2D(*poses.poses[position].tolist())
-                yield position, turned_over(scan) if poses.upside_down else scan, pose
+                yield position, self._prepared(scan, poses.upside_down), pose
 
-    def _map_every(self, scans: int, frame: GridFrame) -> int:
+    def _prepared(self, scan: Scan, upside_down: bool) -> Scan:
+        """The scan as seen from above, and no further than the largest range in use."""
+        if self.options.max_range is not None and scan.range_max > self.options.max_range:
+            scan = replace(scan, range_max=self.options.max_range)
+        return turned_over(scan) if upside_down else scan
+
+    def _map_every(self, scans: int, frame: GridFrame) -> int | None:
         """Every how many scans the map is shown: as asked, else so that the recording stays small."""
+        if not self.viewer.shows:
+            return None
         shown = min(MAP_FRAMES, max(1, MAP_FRAME_CELLS // (frame.rows * frame.cols)))
+        if shown < min(MAP_FRAMES, scans) and not self.options.map_every:
+            self._notes.append(
+                f"the map is large and shown {counted(shown, 'time')} along the way: more often with --map-every, "
+                "or with a coarser --resolution"
+            )
         return self.options.map_every or max(1, -(-scans // shown))
 
     def _begin(self, log: LogReader, scans: ScanLog, poses: LaserPoses, scene: Scene) -> None:
         with self._clock.stage("viewer"):
             self.viewer.begin(scene)
             first = int(scans.stamps[0])
-            self.viewer.event(0, first, f"{len(scans)} of {scans.total} scans on {scans.topic.name}")
+            self.viewer.event(0, first, f"{len(scans)} of {scans.total} scans selected on {scans.topic.name}")
             self.viewer.event(0, first, f"poses: {poses.source} ({poses.origin})")
-            for note in self._notes(log, poses):
-                self.viewer.event(0, first, note, warning=True)
 
-    @staticmethod
-    def _notes(log: LogReader, poses: LaserPoses) -> list[str]:
-        """What a user should know about how the log was read."""
-        notes = [f"lost: {lost}" for lost in log.lost] + list(poses.notes)
+    def _note_what_was_used(self, scans: ScanLog, poses: LaserPoses, used: Used, grid: OccupancyGrid) -> None:
+        """What a user should know about scans that were left out, and about rays that met nothing."""
+        self._notes += [*poses.notes, *scans.notes()]
         outside = int(np.count_nonzero(~poses.valid))
         if outside:
-            scans = "1 scan lies" if outside == 1 else f"{outside} scans lie"
-            notes.append(f"{scans} outside the time of the poses: not used")
-        return notes
+            self._notes.append(f"{counted(outside, 'scan')} outside the time of the poses: not used")
+        if not used.hits:
+            self._notes.append(f"none of {used.rays} rays returned from a surface: nothing is occupied")
+        elif not (grid.free | grid.occupied).any():
+            self._notes.append("no ray crosses the map's bounds: all of it is unknown")
 
-    def _map_scans(self, scans: ScanLog, poses: LaserPoses, mapper: Mapper, judge: Judge, map_every: int) -> int:
-        """Maps, scores and shows scan by scan; returns the number of rays."""
-        rays = 0
+    def _map_scans(
+        self, scans: ScanLog, poses: LaserPoses, mapper: Mapper, judge: Judge, map_every: int | None
+    ) -> Used:
+        """Maps, scores and shows scan by scan; returns what was used."""
+        used = Used()
         pace = Pace(self.options.rate)
         for position, scan, pose in self._posed(scans, poses):
             stamp = int(scans.stamps[position])
@@ -234,28 +300,30 @@ class Pipeline:
             with self._clock.stage("map"):
                 mapper.update(scan, pose)
             seconds = time.perf_counter() - start
-            rays += len(scan.ranges)
             judge.update(position, scan, stamp)
+            used.scans, used.rays, used.hits = (
+                used.scans + 1,
+                used.rays + len(scan.ranges),
+                used.hits + scan.hits.sum(),
+            )
             with self._clock.stage("viewer"):
-                self.viewer.show_scan(position, stamp, pose, scan.points(pose), seconds)
+                self.viewer.show_scan(position, stamp, pose, scan, seconds)
                 error = judge.pose_error(position)
                 if error is not None:
                     self.viewer.show_pose_error(position, stamp, *error)
-            if position % map_every == 0:
-                with self._clock.stage("map"):
-                    grid = mapper.grid()
-                scores = judge.score(grid)
+            if map_every and position % map_every == 0:
                 with self._clock.stage("viewer"):
-                    self.viewer.show_map(position, stamp, grid, scores)
+                    grid = mapper.grid()
+                    self.viewer.show_map(position, stamp, grid, judge.score(grid))
             self._progress(position + 1, len(scans))
-        return rays
+        return used
 
     def _result(
         self,
         log: LogReader,
         scans: ScanLog,
         poses: LaserPoses,
-        rays: int,
+        used: Used,
         grid: OccupancyGrid,
         scores: MapScores | None,
         judge: Judge,
@@ -265,10 +333,10 @@ class Pipeline:
             options=self.options,
             duration=scans.duration,
             scans=scans.total,
-            scans_used=int(np.count_nonzero(poses.valid)),
-            rays=rays,
+            scans_used=used.scans,
+            rays=used.rays,
             lost=tuple(log.lost),
-            notes=tuple(self._notes(log, poses)),
+            notes=(*(f"lost: {lost}" for lost in log.lost), *self._notes),
             messages_lost=log.messages_lost,
             poses=poses,
             stamps=scans.stamps,
@@ -288,7 +356,7 @@ class Judge:
         self._truth = truth
         self._poses = poses
         self._true_poses = true_poses
-        self._map = TruthMap(frame)
+        self._map = TruthMap(frame) if truth is not None and true_poses is not None else None
 
     @property
     def compares_poses(self) -> bool:
@@ -298,13 +366,13 @@ class Judge:
     def update(self, position: int, scan: Scan, stamp: int) -> None:
         """Adds what a perfect sensor would have seen."""
         true = self._true_poses
-        if self._truth is not None and true is not None and true.valid[position]:
-            pose = Pose2D(*true.poses[position].tolist())
-            self._map.update(scan, pose, self._truth.at(stamp))
+        if self._map is None or self._truth is None or true is None or not true.valid[position]:
+            return
+        self._map.update(scan, Pose2D(*true.poses[position].tolist()), self._truth.at(stamp))
 
     def score(self, grid: OccupancyGrid) -> MapScores | None:
         """Scores of the map so far; None without truth."""
-        return None if self._true_poses is None else self._map.score(grid.probability)
+        return None if self._map is None else self._map.score(grid.probability)
 
     def pose_error(self, position: int) -> tuple[float, float] | None:
         """Position (m) and heading (rad) error of one scan's pose; None where poses are not compared."""
@@ -336,5 +404,7 @@ class Pace:
             self._start = time.perf_counter(), stamp
         began, first = self._start
         ahead = (stamp - first) / 1e9 / self._rate - (time.perf_counter() - began)
+        if ahead > MAX_WAIT:  # go on from here, or every scan after the pause would wait as well
+            self._start = time.perf_counter() + MAX_WAIT, stamp
         if ahead > 0:
-            time.sleep(ahead)
+            time.sleep(min(ahead, MAX_WAIT))

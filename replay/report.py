@@ -84,7 +84,7 @@ def write_map(stem: Path, grid: OccupancyGrid) -> None:
     image[grid.free] = 254
     image[grid.occupied] = 0
     rows, cols = grid.frame.shape
-    pgm, yaml = _with_suffix(stem, ".pgm"), _with_suffix(stem, ".yaml")
+    pgm, yaml = map_files(stem)
     x, y = grid.frame.origin
     with _writing(pgm):
         pgm.write_bytes(f"P5\n{cols} {rows}\n255\n".encode() + np.flipud(image).tobytes())
@@ -139,8 +139,10 @@ def _percent(share: float | None) -> str:
     return "-" if share is None else f"{share:.1%}"
 
 
-def _with_suffix(stem: Path, suffix: str) -> Path:
-    return stem.with_name(stem.name.removesuffix(".yaml").removesuffix(".pgm") + suffix)
+def map_files(stem: Path) -> tuple[Path, Path]:
+    """The image and the description of a map that is called ``stem``, with or without either's suffix."""
+    name = stem.name.removesuffix(".yaml").removesuffix(".pgm")
+    return stem.with_name(f"{name}.pgm"), stem.with_name(f"{name}.yaml")
 
 
 @contextmanager

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
@@ -31,6 +32,11 @@ class Selection:
     def __post_init__(self) -> None:
         if self.end is not None and self.duration is not None:
             raise UsageError("--end and --duration say the same: give one of them")
+        for name, value in (("--start", self.start), ("--end", self.end), ("--duration", self.duration)):
+            if value is not None and not math.isfinite(value):
+                raise UsageError(f"{name} is {value:g}: it must be a number of seconds")
+        if self.start is not None and self.start < 0:
+            raise UsageError(f"--start is {self.start:g}: seconds are counted from the first scan on")
         if self.stride < 1:
             raise UsageError(f"--stride is {self.stride}: it must be at least 1")
         if self.n_scans is not None and self.n_scans < 1:
@@ -55,17 +61,17 @@ class ScanLog:
     def __init__(self, log: LogReader, topic: str | None, selection: Selection) -> None:
         self._log = log
         self.topic = _scan_topic(log, topic)
-        all_stamps = [stamp for _, stamp in log.decoded(self.topic, decode_stamp)]
-        self.total = len(all_stamps)
-        stamps = np.array(all_stamps, dtype=np.int64)
-        self.indices = selection.pick(stamps) if self.total else np.zeros(0, dtype=np.intp)
-        if not len(self.indices):
+        self.unusable: dict[int, str] = {}
+        decodable, stamps = self._read_stamps()
+        self.total = len(stamps)
+        picked = selection.pick(stamps) if self.total else np.zeros(0, dtype=np.intp)
+        if not len(picked):
             span = f"{(stamps.max() - stamps.min()) / 1e9:.1f} s" if self.total else "none"
             what = f"no scan is selected of the {self.total} on {self.topic.name} ({span} in all)"
             raise LogReadError(log.path, what, "give another --start, --end or --duration")
-        self.stamps = stamps[self.indices]
-        self.first = next(scan for _, scan in self)
-        self._check_geometry(self.first)
+        self.indices = decodable[picked]
+        self.stamps = stamps[picked]
+        self.first = next((scan for _, scan in self), None) or self._none_usable()
 
     @property
     def times(self) -> ScanTimes:
@@ -81,26 +87,37 @@ class ScanLog:
         return len(self.indices)
 
     def __iter__(self) -> Iterator[tuple[int, Scan]]:
-        """(position among the selected, scan), streamed from the log."""
-        wanted = iter(self.indices.tolist())
-        upcoming = next(wanted, None)
-        position = 0
-        for index, message in enumerate(self._log.messages(self.topic.name)):
-            if index == upcoming:
-                try:
-                    scan = decode_scan(message.data)
-                except ValueError as error:
-                    what = f"scan {index} of {self.topic.name} cannot be decoded: {error}"
-                    raise LogReadError(self._log.path, what) from None
-                yield position, scan
-                position += 1
-                upcoming = next(wanted, None)
-            # the rest of the log is read all the same, since only its end shows whether messages are missing
+        """(position among the selected, scan), streamed from the log; unusable scans are left out."""
+        positions = {index: position for position, index in enumerate(self.indices.tolist())}
+        for index, _, scan in self._log.numbered(self.topic, decode_scan, wanted=positions):
+            if scan.problem:
+                self.unusable[index] = scan.problem
+            else:
+                yield positions[index], scan
 
-    def _check_geometry(self, scan: Scan) -> None:
-        if not scan.range_max > max(scan.range_min, 0.0):
-            what = f"scans on {self.topic.name} have range_min {scan.range_min:g} and range_max {scan.range_max:g} m"
-            raise LogReadError(self._log.path, what, "their range_max must be above range_min and 0")
+    def notes(self) -> list[str]:
+        """What a user should know of scans that were left out."""
+        if not self.unusable:
+            return []
+        index, problem = min(self.unusable.items())
+        return [f"{counted(len(self.unusable), 'scan')} cannot be used, the first one {index}: {problem}"]
+
+    def _read_stamps(self) -> tuple[NDArray[np.intp], Stamps]:
+        """Indices and stamps of the scans whose header can be read."""
+        indices, stamps = [], []
+        for index, _, stamp in self._log.numbered(self.topic, decode_stamp):
+            indices.append(index)
+            stamps.append(stamp)
+        return np.array(indices, dtype=np.intp), np.array(stamps, dtype=np.int64)
+
+    def _none_usable(self) -> Scan:
+        reasons = "; ".join([*self.notes(), *self._log.lost])
+        raise LogReadError(self._log.path, f"no scan on {self.topic.name} can be used: {reasons}")
+
+
+def counted(count: int, what: str) -> str:
+    """1 scan, 2 scans."""
+    return f"{count} {what}{'' if count == 1 else 's'}"
 
 
 def turned_over(scan: Scan) -> Scan:
@@ -115,9 +132,14 @@ def _scan_topic(log: LogReader, wanted: str | None) -> Topic:
         chosen = [topic for topic in topics if topic.name == wanted]
         if not chosen:
             hint = f"its scan topics: {names}" if topics else _listing(log)
-            raise LogReadError(log.path, f"no LaserScan on {wanted}", hint)
+            empty = wanted in log.topics and log.topics[wanted].type == SCAN_TYPE
+            what = f"no messages on {wanted}" if empty else f"no LaserScan on {wanted}"
+            raise LogReadError(log.path, what, hint)
         return chosen[0]
     if not topics:
+        empty_topics = [topic.name for topic in log.topics.values() if topic.type == SCAN_TYPE]
+        if empty_topics:
+            raise LogReadError(log.path, f"no messages on {', '.join(empty_topics)}", *log.lost)
         raise LogReadError(log.path, "no LaserScan in this log", _listing(log))
     if len(topics) > 1:
         raise LogReadError(log.path, f"{len(topics)} scan topics: {names}", "choose one with --scan-topic")

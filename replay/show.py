@@ -8,9 +8,8 @@ from typing import TYPE_CHECKING, Protocol
 
 from mapping.grid import OccupancyGrid
 from prim.errors import UsageError
-from prim.frames import Pose2D
+from prim.frames import Pose2D, Scan
 from prim.metrics import MapScores
-from prim.shapes import FloatArray
 from prim.world import Bounds, World
 
 if TYPE_CHECKING:
@@ -58,13 +57,18 @@ class Scene:
 
 
 class Viewer(Protocol):
-    """Shows a replay on a timeline; ``position`` counts the scans, ``stamp`` is in ns."""
+    """Shows a replay on a timeline; ``position`` counts the scans, ``stamp`` is in ns.
+
+    ``shows`` is False for one that shows nothing, so that no map need be made for it on the way.
+    """
+
+    shows: bool
 
     def begin(self, scene: Scene) -> None:
         """Sets the scene."""
 
-    def show_scan(self, position: int, stamp: int, pose: Pose2D, points: FloatArray, seconds: float) -> None:
-        """A scan's end points (N, 2) in the map frame, the laser's pose, and the mapper's seconds for it."""
+    def show_scan(self, position: int, stamp: int, pose: Pose2D, scan: Scan, seconds: float) -> None:
+        """A scan, the laser's pose in the map frame, and the mapper's seconds for it."""
 
     def show_map(self, position: int, stamp: int, grid: OccupancyGrid, scores: MapScores | None) -> None:
         """The map so far and its scores against the truth."""
@@ -78,14 +82,19 @@ class Viewer(Protocol):
     def finish(self, result: ReplayResult) -> None:
         """The result; nothing is shown after it."""
 
+    def abandon(self) -> None:
+        """The replay failed: what was shown of it is not kept."""
+
 
 class NullViewer:
     """Shows nothing."""
 
+    shows = False
+
     def begin(self, scene: Scene) -> None:
         """Nothing."""
 
-    def show_scan(self, position: int, stamp: int, pose: Pose2D, points: FloatArray, seconds: float) -> None:
+    def show_scan(self, position: int, stamp: int, pose: Pose2D, scan: Scan, seconds: float) -> None:
         """Nothing."""
 
     def show_map(self, position: int, stamp: int, grid: OccupancyGrid, scores: MapScores | None) -> None:
@@ -98,4 +107,7 @@ class NullViewer:
         """Nothing."""
 
     def finish(self, result: ReplayResult) -> None:
+        """Nothing."""
+
+    def abandon(self) -> None:
         """Nothing."""

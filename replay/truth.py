@@ -28,14 +28,14 @@ class Truth:
             return None
         try:
             world = World.from_json(json.loads(attachment))
-        except (ValueError, TypeError, AttributeError) as error:
+        except ValueError as error:
             raise LogReadError(log.path, f"its world.json does not describe a world: {error}") from error
         topic = log.topics.get(TRUE_PRIMITIVES_TOPIC)
         if topic is None or topic.type != MARKERS_TYPE or not topic.messages:
             return cls(world, [])
         moved = [
-            (stamp, replace(world, primitives=primitives))
-            for _, (stamp, primitives) in log.decoded(topic, decode_primitives)
+            (stamp or log_time, replace(world, primitives=primitives))
+            for log_time, (stamp, primitives) in log.decoded(topic, decode_primitives)
         ]
         return cls(world, sorted(moved, key=lambda item: item[0]))
 

@@ -18,7 +18,7 @@ import rerun.blueprint as rrb
 
 from mapping.grid import OccupancyGrid
 from prim.errors import OutputError, PrimError, UsageError
-from prim.frames import Pose2D
+from prim.frames import Pose2D, Scan
 from prim.metrics import MapScores
 from prim.shapes import FloatArray
 from prim.world import World
@@ -38,8 +38,11 @@ TRAIL_POINTS = 2000
 TRAIL_LIFT, SCAN_LIFT, TRUTH_LIFT = 0.0004, 0.0008, 0.0012
 """Heights above the map, as shares of its size: enough to keep what is drawn on it from flickering."""
 
-WEB_PORT = 9090
-"""Where ``--serve`` serves the viewer itself."""
+GRPC_PORT, WEB_PORT = 9876, 9090
+"""Where ``--serve`` serves the recording and the viewer, or at the next ports that are free."""
+
+FLUSH_SECONDS = 60.0
+"""How long the rest of a recording may take to be written or sent."""
 
 CONNECT_SECONDS = 3.0
 """How long a viewer may take to answer."""
@@ -70,6 +73,8 @@ class RerunViewer:
     ``announce`` is told where a served replay can be looked at. Raises UsageError, OutputError or
     ViewerUnreachableError where the recording cannot be sent.
     """
+
+    shows = True
 
     def __init__(self, options: ViewerOptions, announce: Callable[[str], None]) -> None:
         if options.spawn:
@@ -102,25 +107,21 @@ class RerunViewer:
         if scene.world is not None:
             self._send_truth(scene.world)
 
-    def show_scan(self, position: int, stamp: int, pose: Pose2D, points: FloatArray, seconds: float) -> None:
-        """A scan's end points (N, 2) in the map frame, the laser's pose, and the mapper's seconds for it."""
+    def show_scan(self, position: int, stamp: int, pose: Pose2D, scan: Scan, seconds: float) -> None:
+        """A scan, the laser's pose in the map frame, and the mapper's seconds for it."""
         if not self._batch:
             self._batch_started = time.perf_counter()
-        self._batch.append(_ScanEntry(position, stamp, pose, points, seconds))
+        self._batch.append(_ScanEntry(position, stamp, pose, scan.points(pose), seconds))
         self._trail.append((pose.x, pose.y))
         old = time.perf_counter() - self._batch_started > BATCH_SECONDS
         if self._options.live or len(self._batch) >= BATCH_SCANS or (old and self._options.watched):
             self._send_batch()
 
     def show_map(self, position: int, stamp: int, grid: OccupancyGrid, scores: MapScores | None) -> None:
-        """The map so far, the path so far, and the map's scores against the truth."""
+        """The map so far and its scores against the truth."""
         self._send_batch()
         self._at(position, stamp)
         self._recording.log("map/grid", _grid_map(grid))
-        if self._trail:
-            trail = self._lifted(np.asarray(_thin(self._trail, TRAIL_POINTS)), TRAIL_LIFT)
-            dots = rr.Points3D(trail, colors=[TRAIL_COLOR], radii=rr.Radius.ui_points(1.75))
-            self._recording.log("map/trajectory", dots)
         if scores is not None:
             values = [value if (value := getattr(scores, name)) is not None else math.nan for name in SCORES]
             self._recording.log("scores", rr.Scalars(values))
@@ -141,9 +142,20 @@ class RerunViewer:
         rows = "\n".join(f"| **{name}** | {value} |" for name, value in table(result))
         text = f"| | |\n|---|---|\n{rows}\n"
         self._static("summary", rr.TextDocument(text, media_type=rr.MediaType.MARKDOWN))
-        self._recording.flush(timeout_sec=30.0)
+        try:
+            self._recording.flush(timeout_sec=FLUSH_SECONDS)
+        except Exception as error:  # rerun raises plain RuntimeErrors
+            raise RecordingError(f"the recording could not be written in full: {error}") from error
         if not self._options.serve:
             self._recording.disconnect()
+        if self._options.save is not None:
+            _part(self._options.save).replace(self._options.save)
+
+    def abandon(self) -> None:
+        """Closes the recording; the file it was written to is removed, and an earlier one stays as it was."""
+        self._recording.disconnect()
+        if self._options.save is not None:
+            _part(self._options.save).unlink(missing_ok=True)
 
     def _open_sinks(self) -> None:
         options = self._options
@@ -156,10 +168,11 @@ class RerunViewer:
         if options.connect is not None:
             sinks.append(rr.GrpcSink(options.connect))
         if options.serve:
-            url = self._recording.serve_grpc()
-            rr.serve_web_viewer(web_port=WEB_PORT, open_browser=False, connect_to=url)
-            page = f"http://localhost:{WEB_PORT}/?url={quote(url, safe='')}"
-            self._announce(f"serving; in a browser: {page}   or: rerun {url}")
+            url = self._recording.serve_grpc(grpc_port=_free_port(GRPC_PORT))
+            port = _free_port(WEB_PORT)
+            rr.serve_web_viewer(web_port=port, open_browser=False, connect_to=url)
+            self._announce(f"browse: http://localhost:{port}/?url={quote(url, safe='')}")
+            self._announce(f"or:     rerun {url}")
         elif sinks:
             self._recording.set_sinks(*sinks)
 
@@ -202,6 +215,7 @@ class RerunViewer:
             self._send_lasers(index, entries)
             milliseconds = [entry.seconds * 1e3 for entry in entries]
             self._columns("timing", index, rr.Scalars.columns(scalars=milliseconds))
+            self._send_trail(entries[-1])
         errors, self._pose_errors = self._pose_errors, []
         if errors:
             index = _index([(position, stamp) for position, stamp, _, _ in errors])
@@ -216,6 +230,13 @@ class RerunViewer:
         columns = rr.Points3D.columns(positions=points).partition(counts)
         self._columns("map/scan", index, columns)
         self._static_once("map/scan", rr.Points3D.from_fields(colors=[SCAN_COLOR], radii=rr.Radius.ui_points(1.75)))
+
+    def _send_trail(self, last: _ScanEntry) -> None:
+        """The path so far, as dots: a robot that is warped has no line to show."""
+        trail = self._lifted(np.asarray(_thin(self._trail, TRAIL_POINTS)), TRAIL_LIFT)
+        self._at(last.position, last.stamp)
+        dots = rr.Points3D(trail, colors=[TRAIL_COLOR], radii=rr.Radius.ui_points(1.75))
+        self._recording.log("map/trajectory", dots)
 
     def _send_lasers(self, index: Sequence[Any], entries: list[_ScanEntry]) -> None:
         poses = [entry.pose for entry in entries]
@@ -316,10 +337,32 @@ def _thin(points: Sequence[tuple[float, float]], most: int) -> Sequence[tuple[fl
 
 def _file_sink(path: Path) -> Any:
     try:
-        path.open("wb").close()
+        _part(path).open("wb").close()
     except OSError as error:
         raise OutputError(path, error) from error
-    return rr.FileSink(path)
+    return rr.FileSink(_part(path))
+
+
+def _part(path: Path) -> Path:
+    """Where a recording lies until it is whole."""
+    return path.with_name(path.name + ".part")
+
+
+def _free_port(first: int) -> int:
+    """The first port from ``first`` on that nothing listens on."""
+    for port in range(first, first + 100):
+        with socket.socket() as probe:
+            probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            try:
+                probe.bind(("", port))
+            except OSError:
+                continue
+            return port
+    raise UsageError(f"--serve finds no free port from {first} to {first + 99}")
+
+
+class RecordingError(PrimError):
+    """A recording that could not be written or sent."""
 
 
 class ViewerUnreachableError(PrimError):

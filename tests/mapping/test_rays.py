@@ -5,11 +5,13 @@ from fractions import Fraction
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from mapping.deterministic import DeterministicMapper
 from mapping.grid import GridFrame, cell_of
+from mapping.mapper import make_mapper
+from mapping.probabilistic import ProbabilisticMapper, inverse_sensor_model, log_odds
 from mapping.rays import FREE, OCCUPIED, UNSEEN, mark
 from prim.frames import Pose2D, Scan
 
@@ -118,3 +120,79 @@ def test_frames_cover_their_bounds_exactly() -> None:
     assert (frame.cols, frame.rows) == (22, 10)
     assert frame.bounds == pytest.approx((-1.1, -0.3, 1.1, 0.7))
     assert GridFrame.covering(frame.bounds, 0.1) == frame
+
+
+def slow_log_odds(scan: Scan, pose: Pose2D, frame: GridFrame) -> np.ndarray:
+    """Eqs. 3 and 4 by plain loops: Bresenham's line to the end point, walked on at its slope to 0.03 m behind."""
+    odds = np.zeros(frame.shape)
+    resolution = frame.resolution
+    col, row = cell_of(pose.x, resolution), cell_of(pose.y, resolution)
+    for z, bearing in zip(scan.ranges.tolist(), bearings_of(scan, pose), strict=True):
+        if not (z >= scan.range_min and z > 0):
+            continue
+        hit = z < scan.range_max
+        z = min(z, scan.range_max)
+        dx, dy = math.cos(bearing), math.sin(bearing)
+        d_col = cell_of(pose.x + z * dx, resolution) - col
+        d_row = cell_of(pose.y + z * dy, resolution) - row
+        within = d_col == d_row == 0
+        along_x = abs(dx) >= abs(dy) if within else abs(d_col) >= abs(d_row)
+        steps, minor = (abs(d_col), abs(d_row)) if along_x else (abs(d_row), abs(d_col))
+        tilt = Fraction(minor, steps) if steps else Fraction(min(abs(dx), abs(dy)) / max(abs(dx), abs(dy)))
+        last = steps
+        if hit:
+            far = (pose.x + (z + 0.03) * dx, pose.y + (z + 0.03) * dy)
+            last = abs(cell_of(far[0], resolution) - col) if along_x else abs(cell_of(far[1], resolution) - row)
+        for step in range(last + 1):
+            aside = math.floor(step * tilt + Fraction(1, 2))
+            at_col = col + (step if along_x else aside) * (1 if dx >= 0 else -1)
+            at_row = row + (aside if along_x else step) * (1 if dy >= 0 else -1)
+            r, c = at_row - frame.row, at_col - frame.col
+            if 0 <= r < frame.rows and 0 <= c < frame.cols:
+                centre = ((at_col + 0.5) * resolution - pose.x, (at_row + 0.5) * resolution - pose.y)
+                d = math.hypot(*centre) - z if hit else -1.0
+                odds[r, c] += log_odds(inverse_sensor_model(d))
+    return odds
+
+
+def bearings_of(scan: Scan, pose: Pose2D) -> list[float]:
+    return [pose.theta + scan.angle_min + i * scan.angle_increment for i in range(len(scan.ranges))]
+
+
+@pytest.mark.parametrize("resolution", [0.01, 0.05, 0.1, 0.2])
+@settings(max_examples=25)
+@given(seed=st.integers(0, 10**6))
+def test_prob_is_what_plain_loops_give(resolution: float, seed: int) -> None:
+    """Coarse grids too, where a ray may end in the cell that it starts from."""
+    rng = np.random.default_rng(seed)
+    ranges = (rng.random(12) ** 3 * 1.2).astype(np.float32)
+    ranges[rng.random(12) < 0.2] = np.inf
+    scan = Scan(0, "laser", -3.0, 0.5123, 0.005, 1.0, ranges)
+    pose = Pose2D(*rng.uniform(-0.6, 0.6, 2), rng.uniform(-3, 3))
+    mapper = ProbabilisticMapper(resolution, (-0.5, -0.5, 0.5, 0.5))
+    mapper.update(scan, pose)
+    expected = slow_log_odds(scan, pose, mapper.grid().frame)
+    assert mapper.grid().probability == pytest.approx(1 / (1 + np.exp(-expected)), abs=2e-5)
+
+
+@pytest.mark.parametrize("name", ["det", "prob"])
+@pytest.mark.parametrize("far", [1e4, 167772.16, 1e6, 1e9, 1e18, 1e300, math.inf, math.nan])
+def test_poses_far_off_the_grid_write_nowhere(name: str, far: float) -> None:
+    """Beyond 2^21 cells a scan is not used; nearer ones are clipped."""
+    rng = np.random.default_rng(0)
+    for x, y in ((far, 0.0), (-far, 0.3), (0.2, far), (-far, -far)):
+        mapper = make_mapper(name, 0.01, (-1, -1, 1, 1))
+        scan = Scan(0, "laser", -3.1, 0.0123, 0.01, 30.0, rng.uniform(0.1, 29, 500).astype(np.float32))
+        mapper.update(scan, Pose2D(x, y, 0.3))
+        assert (mapper.grid().probability == 0.5).all()
+
+
+@pytest.mark.parametrize("name", ["det", "prob"])
+def test_a_scanner_without_a_range_max_frees_to_the_bounds(name: str) -> None:
+    mapper = make_mapper(name, 0.01, (-1, -1, 1, 1))
+    ranges = np.array([np.inf, 0.5, 1e30], dtype=np.float32)
+    mapper.update(Scan(0, "laser", 0.0, math.pi / 2, 0.01, math.inf, ranges), Pose2D(0.005, 0.005))
+    grid = mapper.grid()
+    assert grid.free[100, 100:].all()
+    assert grid.occupied[150, 100]
+    assert grid.free[100, 1:100].all()

@@ -7,7 +7,7 @@ from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
 from rosbags.typesys import Stores, get_typestore
 
-from prim.errors import LogReadError, OutputError
+from prim.errors import InterruptedRecordingError, LogReadError, OutputError
 from prim.frames import Scan
 from prim.log import LogReader, LogWriter
 from prim.messages import SCAN_TOPIC, SCAN_TYPE, decode_scan, encode_scan
@@ -136,7 +136,7 @@ def test_a_damaged_summary_is_found(tmp_path: Path) -> None:
 
 def test_a_recording_that_broke_off_leaves_what_was_written(tmp_path: Path) -> None:
     path = tmp_path / "a.mcap"
-    with pytest.raises(KeyboardInterrupt), LogWriter(path) as log:
+    with pytest.raises(InterruptedRecordingError, match=r"a\.mcap\.part"), LogWriter(path) as log:
         log.add_topic(SCAN_TOPIC, SCAN_TYPE)
         log.write(SCAN_TOPIC, 1, encode_scan(Scan(1, "laser", 0.0, 0.1, 0.1, 5.0, np.ones(3, dtype=np.float32))))
         raise KeyboardInterrupt

@@ -186,7 +186,50 @@ def test_several_logs(replay: Run, noisy_session: Session, quiet_session: Sessio
     assert replay(noisy_session.path, quiet_session.path, "--mapper", "det", "--no-viewer")[0] == 0
     assert {path.name for path in Path().iterdir()} == {"noisy.det.report.json", "quiet.det.report.json"}
     code, _, err = replay(noisy_session.path, quiet_session.path, "--map", "m")
-    assert (code, "2 logs cannot all write m" in err) == (2, True)
+    assert (code, "would be written twice" in err) == (2, True)
+    twin = Path("twin") / "noisy.mcap"
+    twin.parent.mkdir()
+    twin.write_bytes(noisy_session.path.read_bytes())
+    for logs in ((noisy_session.path, twin), (twin, twin)):
+        assert replay(*logs, "--no-viewer")[0] == 2
+
+
+def test_one_bad_log_does_not_keep_the_others(replay: Run, noisy_session: Session) -> None:
+    Path("bad.mcap").write_bytes(b"")
+    code, _, err = replay("bad.mcap", noisy_session.path, "--no-viewer")
+    assert (code, err.count("\n")) == (1, 1)
+    assert Path("noisy.prob.report.json").exists()
+
+
+@pytest.mark.parametrize("option", ["--save", "--report", "--trajectory"])
+def test_no_output_goes_over_a_log(replay: Run, noisy_session: Session, option: str) -> None:
+    before = noisy_session.path.read_bytes()
+    code, _, err = replay(noisy_session.path, option, noisy_session.path)
+    assert (code, "is a log" in err) == (2, True)
+    assert noisy_session.path.read_bytes() == before
+    assert replay(noisy_session.path, "--report", "same", option, "same")[0] == (0 if option == "--report" else 2)
+
+
+def test_a_replay_that_fails_keeps_the_earlier_recording(replay: Run, noisy_session: Session) -> None:
+    Path("a.rrd").write_text("earlier")
+    data = bytearray(noisy_session.path.read_bytes())
+    data[len(data) // 2] ^= 0xFF
+    Path("bad.mcap").write_bytes(data)
+    assert replay("bad.mcap", "--save", "a.rrd")[0] == 1
+    assert Path("a.rrd").read_text() == "earlier"
+    assert {path.name for path in Path().iterdir()} == {"a.rrd", "bad.mcap"}
+
+
+def test_max_range(replay: Run, noisy_session: Session) -> None:
+    assert replay(noisy_session.path, "--max-range", 0.3, "--no-viewer", "--map", "near")[0] == 0
+    assert replay(noisy_session.path, "--no-viewer", "--map", "far")[0] == 0
+    near, far = (np.frombuffer(Path(f"{name}.pgm").read_bytes()[-220 * 220 :], np.uint8) for name in ("near", "far"))
+    assert np.count_nonzero(near == 0) < np.count_nonzero(far == 0)
+
+
+def test_bounds_that_see_nothing_are_said(replay: Run, noisy_session: Session) -> None:
+    code, _, err = replay(noisy_session.path, "--bounds", 100, 100, 101, 101, "--no-viewer")
+    assert (code, "no ray crosses the map's bounds" in err) == (0, True)
 
 
 def test_a_truncated_log_is_refused_and_salvaged_with_exit_code_3(replay: Run, noisy_session: Session) -> None:
@@ -210,6 +253,12 @@ def test_a_truncated_log_is_refused_and_salvaged_with_exit_code_3(replay: Run, n
         (["--resolution", "1e-5"], "million cells"),
         (["--bounds", "1", "2", "3"], "--bounds"),
         (["--bounds", "1", "0", "0", "1"], "X0 must be below X1"),
+        (["--start", "-1"], "--start"),
+        (["--start", "nan"], "--start"),
+        (["--max-range", "0"], "--max-range"),
+        (["--laser-offset", "nan", "0", "0"], "--laser-offset"),
+        (["--odom-topic", "/odom", "--pose", "tf"], "--odom-topic"),
+        (["--no-viewer", "--map-every", "3"], "--map-every"),
         (["--stride", "0"], "--stride"),
         (["--n-scans", "0"], "--n-scans"),
         (["--end", "1", "--duration", "1"], "give one of them"),

@@ -110,7 +110,7 @@ def test_truth_events_and_summary_are_there(recording: tuple[Path, ReplayResult]
         assert np.array(outline)[:-1, :2] == pytest.approx(primitive.outline(64), abs=1e-6)
     assert len(value(rows["/map/truth/walls"][0], "strips")) == 4
     texts = [value(row, "text")[0] for row in rows["/events"]]
-    assert texts == ["23 of 23 scans on /scan", "poses: truth (/ground_truth/pose)"]
+    assert texts == ["23 of 23 scans selected on /scan", "poses: truth (/ground_truth/pose)"]
     assert "precision" in value(rows["/summary"][0], "text")[0]
     assert rows["/timing"]
 

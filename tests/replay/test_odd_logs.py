@@ -1,0 +1,196 @@
+"""Logs that are readable but odd: each is handled, or refused in one clear line."""
+
+import json
+import math
+from collections.abc import Callable, Iterable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from mcap.writer import Writer
+
+from prim import console
+from prim.frames import Pose2D, Scan
+from prim.log import LogWriter
+from prim.messages import ODOMETRY_TYPE, POINT_TYPE, POSE_TYPE, SCAN_TYPE, encode_odometry, encode_point, encode_scan
+from replay.cli import app
+
+SECOND = 10**9
+GOOD = Scan(0, "laser", -math.pi, 0.1, 0.1, 5.0, np.full(63, 1.0, dtype=np.float32))
+
+
+def write(path: Path, scans: Iterable[Scan | bytes], *others: tuple[str, str, list[tuple[int, bytes]]]) -> Path:
+    """Scans a second apart; the robot stands at the origin unless other topics say otherwise."""
+    with LogWriter(path) as log:
+        log.add_topic("/scan", SCAN_TYPE)
+        count = 0
+        for index, scan in enumerate(scans):
+            stamp = (index + 1) * SECOND
+            data = scan if isinstance(scan, bytes) else encode_scan(replace(scan, stamp=scan.stamp or stamp))
+            log.write("/scan", stamp, data)
+            count = index + 1
+        poses = [(stamp * SECOND, encode_odometry(stamp * SECOND, Pose2D())) for stamp in range(count + 2)]
+        for topic, kind, messages in others or [("/odom", ODOMETRY_TYPE, poses)]:
+            log.add_topic(topic, kind)
+            for stamp, data in messages:
+                log.write(topic, stamp, data)
+    return path
+
+
+Replay = Callable[..., tuple[int, str, dict[str, Any]]]
+
+
+@pytest.fixture
+def replay(in_tmp: Path, capsys: pytest.CaptureFixture[str]) -> Replay:
+    """Exit code, stderr, report."""
+
+    def run(*arguments: object) -> tuple[int, str, dict[str, Any]]:
+        arguments = (*arguments, "--no-viewer", "--mapper", "det", "--report", "r.json")
+        code = console.run(app, "prim-replay", [str(argument) for argument in arguments])
+        report = json.loads(Path("r.json").read_text()) if code in (0, 3) else {}
+        return code, capsys.readouterr().err, report
+
+    return run
+
+
+def with_ranges(*ranges: float) -> Scan:
+    return replace(GOOD, ranges=np.array(ranges, dtype=np.float32))
+
+
+@pytest.mark.parametrize("ranges", [[math.nan] * 9, [math.inf] * 9, [-math.inf] * 9, []])
+def test_nothing_returned(replay: Replay, ranges: list[float]) -> None:
+    code, err, report = replay(write(Path("a.mcap"), [with_ranges(*ranges)] * 3))
+    assert (code, report["log"]["scans_used"]) == (0, 3)
+    assert "rays returned from a surface" in err
+
+
+@pytest.mark.parametrize(
+    "odd",
+    [
+        {"range_max": math.nan},
+        {"range_max": 0.0},
+        {"range_max": 0.05},
+        {"range_min": math.nan},
+        {"angle_min": math.nan},
+        {"angle_increment": math.inf},
+    ],
+)
+def test_a_scan_with_impossible_limits_is_left_out_and_said(replay: Replay, odd: dict[str, float]) -> None:
+    code, err, report = replay(write(Path("a.mcap"), [GOOD, replace(GOOD, **odd), GOOD]))
+    assert (code, report["log"]["scans"], report["log"]["scans_used"]) == (0, 3, 2)
+    assert "1 scan cannot be used, the first one 1" in err
+    code, err, _ = replay(write(Path("b.mcap"), [replace(GOOD, **odd)] * 2))
+    assert (code, "no scan on /scan can be used" in err, err.count("\n")) == (1, True, 1)
+
+
+def test_scans_whose_beams_change(replay: Replay) -> None:
+    code, err, report = replay(write(Path("a.mcap"), [GOOD, with_ranges(1.0, 1.0), GOOD]))
+    assert (code, err.count("\n"), report["log"]["rays"]) == (0, 1, 63 + 2 + 63)
+
+
+def test_a_scan_that_cannot_be_decoded(replay: Replay) -> None:
+    log = write(Path("a.mcap"), [GOOD, encode_scan(GOOD)[:60], GOOD])
+    code, err, _ = replay(log)
+    assert (code, "message 1 of /scan cannot be decoded" in err, "--recover" in err) == (1, True, True)
+    code, err, report = replay(log, "--recover")
+    assert (code, report["log"]["scans_used"], report["log"]["messages_lost"]) == (3, 2, 1)
+    assert "note: lost: messages of /scan that cannot be decoded" in err
+
+
+def test_stamps_that_repeat_or_go_back(replay: Replay) -> None:
+    stamps = (3, 2, 2, 1)
+    code, _, report = replay(write(Path("a.mcap"), [replace(GOOD, stamp=stamp * SECOND) for stamp in stamps]))
+    assert (code, report["log"]["scans_used"], report["log"]["duration_s"]) == (0, 4, 2.0)
+
+
+def test_true_poses_of_another_type_are_passed_over(replay: Replay) -> None:
+    fixes = [(SECOND, encode_point(SECOND, 0, 0))]
+    odometry = [(stamp * SECOND, encode_odometry(stamp * SECOND, Pose2D())) for stamp in range(5)]
+    log = write(
+        Path("a.mcap"), [GOOD] * 3, ("/ground_truth/pose", POINT_TYPE, fixes), ("/odom", ODOMETRY_TYPE, odometry)
+    )
+    code, _, report = replay(log)
+    assert (code, report["pose"]["source"]) == (0, "odom")
+    assert replay(log, "--pose", "truth")[0] == 1
+
+
+def test_an_empty_topic_is_said_to_be_empty(replay: Replay) -> None:
+    code, err, _ = replay(write(Path("a.mcap"), []))
+    assert (code, "no messages on /scan" in err) == (1, True)
+    code, err, _ = replay(write(Path("b.mcap"), [GOOD], ("/odom", ODOMETRY_TYPE, [])), "--odom-topic", "/odom")
+    assert (code, "no messages on /odom" in err) == (1, True)
+
+
+def test_a_gap_between_poses_is_said(replay: Replay) -> None:
+    poses = [(second * SECOND, encode_odometry(second * SECOND, Pose2D())) for second in (0, 1, 9)]
+    code, err, report = replay(write(Path("a.mcap"), [GOOD] * 4, ("/odom", ODOMETRY_TYPE, poses)))
+    assert (code, report["log"]["scans_used"]) == (0, 4)
+    assert "3 scans lie in a gap of up to 8.0 s" in err
+
+
+def test_a_world_that_is_none_is_said(replay: Replay) -> None:
+    with LogWriter(Path("a.mcap")) as log:
+        log.attach("world.json", "application/json", b"[1]", 1)
+        log.add_topic("/scan", SCAN_TYPE)
+        log.write("/scan", SECOND, encode_scan(replace(GOOD, stamp=SECOND)))
+    code, err, report = replay("a.mcap", "--standing-still")
+    assert (code, report["map"]["scores"]) == (0, None)
+    assert "the map is not scored" in err
+
+
+def test_true_poses_without_a_world_still_judge_the_poses(replay: Replay) -> None:
+    from prim.messages import encode_pose
+
+    true = [(s * SECOND, encode_pose(s * SECOND, Pose2D(0.3, 0.4, 0.0))) for s in range(5)]
+    odometry = [(s * SECOND, encode_odometry(s * SECOND, Pose2D())) for s in range(5)]
+    log = write(
+        Path("a.mcap"), [GOOD] * 3, ("/ground_truth/pose", POSE_TYPE, true), ("/odom", ODOMETRY_TYPE, odometry)
+    )
+    code, _, report = replay(log, "--pose", "odom")
+    assert (code, report["map"]["scores"]) == (0, None)
+    assert report["pose"]["rmse_m"] == pytest.approx(0.5)
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {"use_chunking": False},
+        {"repeat_channels": False, "repeat_schemas": False},
+        {"use_statistics": False},
+        {"use_summary_offsets": False},
+        {"compression": "none"},
+        {"compression": "lz4"},
+        {"enable_crcs": False},
+    ],
+    ids=str,
+)
+def test_logs_that_other_writers_make(replay: Replay, options: dict[str, Any]) -> None:
+    from mcap.writer import CompressionType
+
+    if "compression" in options:
+        options = {"compression": CompressionType[options["compression"].upper()]}
+    with Path("a.mcap").open("wb") as stream:
+        writer = Writer(stream, **options)
+        writer.start("ros2")
+        channel = writer.register_channel("/scan", "cdr", writer.register_schema(SCAN_TYPE, "ros2msg", b""))
+        for second in (1, 2, 3):
+            data = encode_scan(replace(GOOD, stamp=second * SECOND))
+            writer.add_message(channel, second * SECOND, data, second * SECOND)
+        writer.finish()
+    for recover in ([], ["--recover"]):
+        code, err, report = replay("a.mcap", "--standing-still", *recover)
+        assert (code, err, report["log"]["scans_used"]) == (0, "", 3)
+
+
+@pytest.mark.parametrize("encoding", ["json", "ros1", "protobuf"])
+def test_other_encodings_are_named(replay: Replay, encoding: str) -> None:
+    with Path("a.mcap").open("wb") as stream:
+        writer = Writer(stream)
+        writer.start()
+        channel = writer.register_channel("/scan", encoding, writer.register_schema(SCAN_TYPE, encoding, b""))
+        writer.add_message(channel, 1, b"{}", 1)
+        writer.finish()
+    code, err, _ = replay("a.mcap", "--standing-still")
+    assert (code, repr(encoding) in err, err.count("\n")) == (1, True, 1)
