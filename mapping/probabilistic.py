@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from mapping.grid import Layer, OccupancyGrid
 from mapping.rays import add_log_odds, end_extent
 from prim.frames import Pose2D, Scan
-from prim.shapes import FloatArray
+from prim.raycast import FloatArray
 from prim.world import Bounds
 
 FREE_PROBABILITY = 0.3

@@ -10,7 +10,7 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from prim.shapes import FloatArray
+from prim.raycast import FloatArray
 
 Stamps = NDArray[np.int64]
 

@@ -22,7 +22,6 @@ from mcap.records import Attachment, Channel, Chunk, McapRecord, Metadata, Schem
 from mcap.records import Message as McapMessage
 from mcap.stream_reader import CRCValidationError, StreamReader, breakup_chunk
 from mcap.summary import Summary
-from mcap.writer import CompressionType, Writer
 
 from prim.errors import InterruptedRecordingError, LogReadError, OutputError
 from prim.messages import message_definition
@@ -346,6 +345,8 @@ class LogWriter:
             self._file = self.part.open("wb")
         except OSError as error:
             raise OutputError(path, error) from error
+        from mcap.writer import CompressionType, Writer  # when it is needed: a replay starts faster
+
         self._writer = Writer(self._file, chunk_size=CHUNK_BYTES, compression=CompressionType.ZSTD, enable_crcs=True)
         self._writer.start(profile="ros2", library="prim")
         self._channels: dict[str, int] = {}

@@ -1,7 +1,7 @@
 """The log's topics and the codecs of its messages: CDR bytes on one side, our own types on the other.
 
-LaserScan has a codec of its own, since it is most of a log; the rest goes through rosbags' typestore, which is
-imported when it is first needed.
+What a replay reads is read by a cursor of our own, several times as fast as a typestore and ready at once; scans are
+written by our own codec, and all other messages by rosbags' typestore, which is imported when it is first needed.
 """
 
 from __future__ import annotations
@@ -15,8 +15,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from prim.cdr import SECOND, CdrReader
 from prim.frames import Pose2D, Scan
-from prim.shapes import FloatArray, Kind, Primitive
+from prim.raycast import FloatArray
+from prim.shapes import Kind, Primitive
 from prim.world import World
 
 SCAN_TOPIC = "/scan"
@@ -52,7 +54,6 @@ KIND_COLORS: dict[Kind, tuple[int, int, int]] = {
 """One colour per kind (RGB), from Okabe and Ito's palette for all kinds of colour vision."""
 
 _LITTLE_ENDIAN = b"\x00\x01\x00\x00"
-_SECOND = 1_000_000_000
 
 
 class StampedPose(NamedTuple):
@@ -71,7 +72,7 @@ class StampedPose(NamedTuple):
 def encode_scan(scan: Scan) -> bytes:
     """A scan as the CDR bytes of sensor_msgs/LaserScan, without intensities."""
     frame = scan.frame_id.encode() + b"\x00"
-    head = struct.pack("<iII", *divmod(scan.stamp, _SECOND), len(frame)) + frame
+    head = struct.pack("<iII", *divmod(scan.stamp, SECOND), len(frame)) + frame
     count = len(scan.ranges)
     geometry = struct.pack(
         "<7fI",
@@ -92,28 +93,17 @@ def encode_scan(scan: Scan) -> bytes:
 
 def decode_scan(data: bytes) -> Scan:
     """The inverse of :func:`encode_scan`, either byte order. Raises ValueError on bytes that are no LaserScan."""
-    order = _byte_order(data)
-    try:
-        seconds, nanoseconds, length = struct.unpack_from(order + "iII", data, 4)
-        geometry = 16 + length + (-length % 4)
-        if length > len(data):
-            raise ValueError(f"its frame_id claims {length} bytes of {len(data)}")
-        frame_id = data[16 : 16 + max(length - 1, 0)].decode()
-        values = struct.unpack_from(order + "7fI", data, geometry)
-    except (struct.error, UnicodeDecodeError) as error:
-        raise ValueError(f"not a LaserScan: {error}") from None
-    angle_min, _, angle_increment, time_increment, scan_time, range_min, range_max, count = values
-    start = geometry + 32
-    if 4 * count > len(data) - start:
-        raise ValueError(f"it claims {count} ranges where {max(len(data) - start, 0) // 4} fit")
+    cdr = CdrReader(data)
+    stamp, frame_id = cdr.header()
+    angle_min, _, angle_increment, time_increment, scan_time, range_min, range_max = cdr.unpack("7f", 4)
     return Scan(
-        stamp=seconds * _SECOND + nanoseconds,
+        stamp=stamp,
         frame_id=frame_id,
         angle_min=angle_min,
         angle_increment=angle_increment,
         range_min=range_min,
         range_max=range_max,
-        ranges=np.frombuffer(data, order + "f4", count, start).astype(np.float32),
+        ranges=cdr.floats(),
         time_increment=time_increment,
         scan_time=scan_time,
     )
@@ -121,17 +111,7 @@ def decode_scan(data: bytes) -> Scan:
 
 def decode_stamp(data: bytes) -> int:
     """The stamp (ns) of a CDR message that begins with a header. Raises ValueError."""
-    try:
-        seconds, nanoseconds = struct.unpack_from(_byte_order(data) + "iI", data, 4)
-    except struct.error as error:
-        raise ValueError(f"no header: {error}") from None
-    return int(seconds) * _SECOND + int(nanoseconds)
-
-
-def _byte_order(data: bytes) -> str:
-    if len(data) < 4 or data[0] != 0 or data[1] not in (0, 1):
-        raise ValueError("not plain CDR: its encapsulation header is " + (data[:4].hex(" ") or "missing"))
-    return "<" if data[1] else ">"
+    return CdrReader(data).stamp()
 
 
 # All other messages
@@ -155,15 +135,6 @@ def _new(type_name: str, **fields: Any) -> Any:
 
 def _serialize(message: Any) -> bytes:
     return bytes(_typestore().serialize_cdr(message, message.__msgtype__))
-
-
-def decode_message(type_name: str, data: bytes) -> Any:
-    """A message as rosbags decodes it. Raises ValueError on bytes that are no such message."""
-    _byte_order(data)
-    try:
-        return _typestore().deserialize_cdr(data, type_name)
-    except Exception as error:  # rosbags raises what its generated code meets: struct, index, unicode errors
-        raise ValueError(f"not a {type_name}: {error}") from None
 
 
 def encode_odometry(stamp: int, pose: Pose2D) -> bytes:
@@ -217,25 +188,24 @@ def decode_primitives(data: bytes) -> tuple[int, tuple[Primitive, ...]]:
 
     Raises ValueError.
     """
-    markers = decode_message(MARKERS_TYPE, data).markers
-    primitives = []
-    for marker in markers:
-        if marker.ns == "primitives":
-            truth = json.loads(marker.text)
+    cdr = CdrReader(data)
+    stamp, primitives = 0, []
+    for _ in range(cdr.length(1)):
+        pose, namespace, text = _read_marker(cdr)
+        stamp = pose.stamp
+        if namespace == "primitives":
+            truth = json.loads(text)
             if not isinstance(truth, dict):
-                raise ValueError(f"a marker's text is no object: {marker.text}")
-            pose = _stamped(marker.header, "", marker.pose.position, marker.pose.orientation)
-            turn = planar(pose)
-            primitives.append(
-                Primitive.from_json({**truth, "x": turn.x, "y": turn.y, "theta": turn.theta}).canonical()
-            )
-    stamp = _nanoseconds(markers[0].header.stamp) if markers else 0
+                raise ValueError(f"a marker's text is no object: {text}")
+            seen = planar(pose)
+            primitive = Primitive.from_json({**truth, "x": seen.x, "y": seen.y, "theta": seen.theta})
+            primitives.append(primitive.canonical())
     return stamp, tuple(primitives)
 
 
 def decode_poses(type_name: str, data: bytes) -> list[StampedPose]:
     """The poses in a message of any type in :data:`POSE_DECODERS`. Raises ValueError."""
-    return POSE_DECODERS[type_name](decode_message(type_name, data))
+    return POSE_DECODERS[type_name](CdrReader(data))
 
 
 def planar(pose: StampedPose) -> Pose2D:
@@ -245,33 +215,60 @@ def planar(pose: StampedPose) -> Pose2D:
     return Pose2D(pose.translation[0], pose.translation[1], heading)
 
 
-POSE_DECODERS: dict[str, Callable[[Any], list[StampedPose]]] = {
-    ODOMETRY_TYPE: lambda m: [_stamped(m.header, m.child_frame_id, m.pose.pose.position, m.pose.pose.orientation)],
-    POSE_TYPE: lambda m: [_stamped(m.header, "", m.pose.position, m.pose.orientation)],
-    POSE_WITH_COVARIANCE_TYPE: lambda m: [_stamped(m.header, "", m.pose.pose.position, m.pose.pose.orientation)],
-    TF_TYPE: lambda m: [
-        _stamped(t.header, t.child_frame_id, t.transform.translation, t.transform.rotation) for t in m.transforms
-    ],
+def _read_pose(cdr: CdrReader, stamp: int, frame_id: str, child_frame_id: str) -> StampedPose:
+    """A Pose or a Transform: they have the same fields."""
+    x, y, z, qx, qy, qz, qw = cdr.unpack("7d", 8)
+    return StampedPose(stamp, frame_id, child_frame_id, (x, y, z), (qx, qy, qz, qw))
+
+
+def _read_pose_stamped(cdr: CdrReader) -> list[StampedPose]:
+    return [_read_pose(cdr, *cdr.header(), "")]
+
+
+def _read_odometry(cdr: CdrReader) -> list[StampedPose]:
+    return [_read_pose(cdr, *cdr.header(), cdr.string())]
+
+
+def _read_transforms(cdr: CdrReader) -> list[StampedPose]:
+    return [_read_pose(cdr, *cdr.header(), cdr.string()) for _ in range(cdr.length(1))]
+
+
+POSE_DECODERS: dict[str, Callable[[CdrReader], list[StampedPose]]] = {
+    ODOMETRY_TYPE: _read_odometry,
+    POSE_TYPE: _read_pose_stamped,
+    POSE_WITH_COVARIANCE_TYPE: _read_pose_stamped,
+    TF_TYPE: _read_transforms,
 }
 """Message types that hold poses, and how to read them."""
 
 
-def _stamped(header: Any, child: str, position: Any, orientation: Any) -> StampedPose:
-    return StampedPose(
-        _nanoseconds(header.stamp),
-        header.frame_id,
-        child,
-        (position.x, position.y, position.z),
-        (orientation.x, orientation.y, orientation.z, orientation.w),
-    )
-
-
-def _nanoseconds(stamp: Any) -> int:
-    return int(stamp.sec) * _SECOND + int(stamp.nanosec)
+def _read_marker(cdr: CdrReader) -> tuple[StampedPose, str, str]:
+    """A visualization_msgs/Marker: its pose, namespace and text."""
+    stamp, frame_id = cdr.header()
+    namespace = cdr.string()
+    cdr.unpack("3i", 4)  # id, type, action
+    pose = _read_pose(cdr, stamp, frame_id, "")
+    cdr.unpack("3d", 8)  # scale
+    cdr.unpack("4f", 4)  # color
+    cdr.unpack("iI", 4)  # lifetime
+    cdr.unpack("?", 1)  # frame_locked
+    cdr.skip(24, 8)  # points
+    cdr.skip(16, 4)  # colors
+    cdr.string()  # texture_resource
+    cdr.header()  # texture: a CompressedImage
+    cdr.string()
+    cdr.skip(1, 1)
+    cdr.skip(8, 4)  # uv_coordinates
+    text = cdr.string()
+    cdr.string()  # mesh_resource
+    cdr.string()  # mesh_file
+    cdr.skip(1, 1)
+    cdr.unpack("?", 1)  # mesh_use_embedded_materials
+    return pose, namespace, text
 
 
 def _time(stamp: int) -> Any:
-    seconds, nanoseconds = divmod(stamp, _SECOND)
+    seconds, nanoseconds = divmod(stamp, SECOND)
     return _new("builtin_interfaces/msg/Time", sec=seconds, nanosec=nanoseconds)
 
 

@@ -10,7 +10,8 @@ from typing import SupportsInt
 import numpy as np
 from numpy.typing import NDArray
 
-from prim.shapes import FloatArray, Primitive, angle_error
+from prim.raycast import FloatArray
+from prim.shapes import Primitive, angle_error
 
 BoolGrid = NDArray[np.bool_]
 

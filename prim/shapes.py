@@ -25,9 +25,8 @@ from enum import StrEnum
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-FloatArray = NDArray[np.float64]
+from prim.raycast import FloatArray, cast_ellipses, cast_segments
 
 SIDES_AGREE = 0.03
 """Sides that differ by no more than this share make a shape look more symmetric than its kind is."""
@@ -141,7 +140,7 @@ class Primitive:
     def local_outline(self, points: int = OUTLINE_POINTS) -> FloatArray:
         """Counter-clockwise vertices in the shape's own frame, (N, 2) in metres, the first not repeated."""
         width, height = self.width_height
-        if self.kind in (Kind.CIRCLE, Kind.ELLIPSE):
+        if self.is_round:
             turn = np.linspace(0, 2 * np.pi, points, endpoint=False)
             return np.column_stack((width * np.cos(turn), height * np.sin(turn)))
         if self.kind is Kind.TRIANGLE:
@@ -155,18 +154,28 @@ class Primitive:
         outline += self.x, self.y
         return outline
 
+    @property
+    def is_round(self) -> bool:
+        """Whether the outline is an ellipse or a circle, and no polygon."""
+        return self.kind in (Kind.CIRCLE, Kind.ELLIPSE)
+
     def cast(self, origin: tuple[float, float], directions: FloatArray) -> FloatArray:
         """Exact distances (m) from ``origin`` along unit ``directions`` (N, 2), map frame; inf for a miss.
 
         From inside the shape it is the distance to its outline.
         """
-        cos, sin = math.cos(self.theta or 0.0), math.sin(self.theta or 0.0)
-        turn = np.array([[cos, -sin], [sin, cos]])
-        local_origin = np.array([origin[0] - self.x, origin[1] - self.y]) @ turn
-        local_directions = directions @ turn
-        if self.kind in (Kind.CIRCLE, Kind.ELLIPSE):
-            return _cast_unit_circle(local_origin / self.width_height, local_directions / self.width_height)
-        return _cast_convex(local_origin, local_directions, self.local_outline())
+        if self.is_round:
+            return cast_ellipses(origin, directions, np.array([self.as_ellipse()]))
+        return cast_segments(origin, directions, self.as_segments())
+
+    def as_ellipse(self) -> tuple[float, float, float, float, float]:
+        """A round shape as :func:`prim.raycast.cast_ellipses` takes it."""
+        return self.x, self.y, self.theta or 0.0, *self.width_height
+
+    def as_segments(self) -> FloatArray:
+        """The edges (M, 4) of a shape with corners as :func:`prim.raycast.cast_segments` takes them."""
+        corners = self.outline()
+        return np.hstack((corners, np.roll(corners, -1, axis=0)))
 
     def to_json(self) -> dict[str, Any]:
         """As reports and ``world.json`` hold it."""
@@ -205,28 +214,3 @@ def angle_error(estimate: Primitive, truth: Primitive) -> float | None:
     if truth.symmetry is None or estimate.theta is None or truth.theta is None:
         return None
     return abs(angle_difference(estimate.theta, truth.theta, truth.symmetry))
-
-
-def _cast_unit_circle(origin: FloatArray, directions: FloatArray) -> FloatArray:
-    """Smallest t >= 0 with |origin + t directions| = 1; the directions (N, 2) need not be unit vectors."""
-    a = np.einsum("ij,ij->i", directions, directions)
-    b = directions @ origin
-    c = float(origin @ origin) - 1.0
-    discriminant = b * b - a * c
-    root = np.sqrt(np.maximum(discriminant, 0.0))
-    distance = (-b - root) / a if c > 0 else (-b + root) / a
-    return np.where((discriminant < 0) | (distance < 0), np.inf, distance)
-
-
-def _cast_convex(origin: FloatArray, directions: FloatArray, vertices: FloatArray) -> FloatArray:
-    """Distance to a convex polygon with counter-clockwise ``vertices`` (M, 2): the slab method over its edges."""
-    edges = np.roll(vertices, -1, axis=0) - vertices
-    normals = np.column_stack((edges[:, 1], -edges[:, 0]))
-    outside = (origin - vertices)[:, 0] * normals[:, 0] + (origin - vertices)[:, 1] * normals[:, 1]
-    speed = directions @ normals.T
-    with np.errstate(divide="ignore", invalid="ignore"):
-        crossing = -outside / speed
-    enter = np.where(speed < 0, crossing, -np.inf).max(axis=1)
-    leave = np.where(speed > 0, crossing, np.inf).min(axis=1)
-    misses = (enter > leave) | (leave < 0) | ((speed == 0) & (outside > 0)).any(axis=1)
-    return np.where(misses, np.inf, np.where(enter >= 0, enter, leave))

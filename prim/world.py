@@ -6,13 +6,15 @@ import json
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from prim.errors import WorldError
-from prim.shapes import FloatArray, Primitive
+from prim.raycast import FloatArray, cast_ellipses, cast_segments
+from prim.shapes import Primitive
 
 Wall = tuple[float, float, float, float]
 """A thin wall from (x0, y0) to (x1, y1), metres, map frame."""
@@ -42,10 +44,18 @@ class World:
 
     def cast(self, origin: tuple[float, float], directions: FloatArray) -> FloatArray:
         """Exact distances (m) to the nearest surface along unit ``directions`` (N, 2); inf where there is none."""
-        distances = _cast_walls(origin, directions, self.walls)
-        for primitive in self.primitives:
-            np.minimum(distances, primitive.cast(origin, directions), out=distances)
-        return distances
+        flat = cast_segments(origin, directions, self._segments)
+        return np.minimum(flat, cast_ellipses(origin, directions, self._ellipses))
+
+    @cached_property
+    def _segments(self) -> FloatArray:
+        edges = [primitive.as_segments() for primitive in self.primitives if not primitive.is_round]
+        return np.vstack([np.asarray(self.walls, dtype=float).reshape(-1, 4), *edges])
+
+    @cached_property
+    def _ellipses(self) -> FloatArray:
+        rounds = [primitive.as_ellipse() for primitive in self.primitives if primitive.is_round]
+        return np.asarray(rounds, dtype=float).reshape(-1, 5)
 
     def to_json(self) -> dict[str, Any]:
         """As the log's attachment ``world.json`` holds it."""
@@ -97,19 +107,3 @@ def _numbers(value: Any, count: int, what: str) -> tuple[float, ...]:
     if not all(math.isfinite(number) for number in numbers):
         raise ValueError(f"{what} has a number that is not finite: {numbers}")
     return numbers
-
-
-def _cast_walls(origin: tuple[float, float], directions: FloatArray, walls: Sequence[Wall]) -> FloatArray:
-    """Distances to the nearest of thin ``walls``; their ends belong to them, so that corners are closed."""
-    if not walls:
-        return np.full(len(directions), np.inf)
-    ends = np.asarray(walls, dtype=float)
-    along = ends[:, 2:] - ends[:, :2]
-    towards = ends[:, :2] - origin
-    cross = directions[:, :1] * along[:, 1] - directions[:, 1:] * along[:, 0]
-    with np.errstate(divide="ignore", invalid="ignore"):
-        distance = (towards[:, 0] * along[:, 1] - towards[:, 1] * along[:, 0]) / cross
-        share = (towards[:, 0] * directions[:, 1:] - towards[:, 1] * directions[:, :1]) / cross
-    hits = (cross != 0) & (distance >= 0) & (share >= -1e-12) & (share <= 1 + 1e-12)
-    nearest: FloatArray = np.where(hits, distance, np.inf).min(axis=1)
-    return nearest

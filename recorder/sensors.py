@@ -9,7 +9,7 @@ import numpy as np
 
 from prim.frames import Pose2D, Scan, beam_directions
 from prim.messages import LASER_FRAME
-from prim.shapes import FloatArray
+from prim.raycast import FloatArray
 from prim.world import World
 
 

@@ -27,7 +27,7 @@ from prim.messages import (
     decode_poses,
     planar,
 )
-from prim.shapes import FloatArray
+from prim.raycast import FloatArray
 
 SOURCES = ("auto", "truth", "tf", "odom")
 STILL = "still"

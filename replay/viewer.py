@@ -20,7 +20,7 @@ from mapping.grid import OccupancyGrid
 from prim.errors import OutputError, PrimError, UsageError
 from prim.frames import Pose2D, Scan
 from prim.metrics import MapScores
-from prim.shapes import FloatArray
+from prim.raycast import FloatArray
 from prim.world import World
 from replay.pipeline import ReplayResult
 from replay.report import table

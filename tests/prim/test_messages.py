@@ -14,7 +14,6 @@ from prim.messages import (
     POSE_TYPE,
     SCAN_TYPE,
     TF_TYPE,
-    decode_message,
     decode_poses,
     decode_primitives,
     decode_scan,
@@ -71,7 +70,7 @@ def test_our_scans_are_rosbags_scans(scan: Scan) -> None:
 def test_cut_scans_are_refused(scan: Scan, data: st.DataObject) -> None:
     whole = encode_scan(scan)
     cut = data.draw(st.integers(0, len(whole) - 5))  # the last four bytes count the intensities, which are not read
-    with pytest.raises(ValueError, match=r"CDR|LaserScan|claims"):
+    with pytest.raises(ValueError, match=r"CDR|ends at byte|claims"):
         decode_scan(whole[:cut])
 
 
@@ -81,7 +80,7 @@ def test_counts_are_held_against_the_bytes_that_are_there(claimed: int) -> None:
     whole = bytearray(encode_scan(scan))
     at = whole.index(struct.pack("<I", 4), 40)
     whole[at : at + 4] = struct.pack("<I", claimed)
-    with pytest.raises(ValueError, match=f"claims {claimed} ranges where 5 fit"):
+    with pytest.raises(ValueError, match=f"claims {claimed} items"):
         decode_scan(bytes(whole))
 
 
@@ -103,7 +102,7 @@ def test_poses_round_trip(theta: float) -> None:
 
 def test_odometry_carries_the_covariance() -> None:
     pose = Pose2D(0, 0, 0, np.arange(9.0).reshape(3, 3))
-    matrix = decode_message(ODOMETRY_TYPE, encode_odometry(0, pose)).pose.covariance.reshape(6, 6)
+    matrix = STORE.deserialize_cdr(encode_odometry(0, pose), ODOMETRY_TYPE).pose.covariance.reshape(6, 6)
     assert matrix[np.ix_((0, 1, 5), (0, 1, 5))].tolist() == pose.covariance.tolist()
     assert matrix.sum() == pose.covariance.sum()
 
@@ -111,7 +110,7 @@ def test_odometry_carries_the_covariance() -> None:
 def test_compass_points_north() -> None:
     """A robot that faces east (x) has north (y) at its left; one that faces north has it ahead."""
     for heading, expected in ((0.0, (0, 1)), (math.pi / 2, (1, 0))):
-        north = decode_message("geometry_msgs/msg/Vector3Stamped", encode_compass(0, heading)).vector
+        north = STORE.deserialize_cdr(encode_compass(0, heading), "geometry_msgs/msg/Vector3Stamped").vector
         assert (north.x, north.y) == pytest.approx(expected, abs=1e-12)
 
 
@@ -134,5 +133,5 @@ def test_primitives_round_trip() -> None:
 )
 def test_other_bytes_are_refused(data: bytes) -> None:
     for decode in (decode_scan, decode_primitives, lambda d: decode_poses(TF_TYPE, d)):
-        with pytest.raises(ValueError, match=r"not|CDR|claims|no header"):
+        with pytest.raises(ValueError, match=r"not|CDR|claims|ends at byte"):
             decode(data)

@@ -5,6 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import shapely
+from rosbags.typesys import Stores, get_typestore
 
 from prim import console
 from prim.errors import UsageError, WorldError
@@ -14,7 +15,6 @@ from prim.messages import (
     POSE_TYPE,
     SCAN_TOPIC,
     TRUE_POSE_TOPIC,
-    decode_message,
     decode_poses,
     decode_scan,
     planar,
@@ -26,6 +26,8 @@ from recorder.sensors import Compass, Gps, Lidar
 from recorder.session import Session, SessionOptions, record
 from recorder.simulator import ROBOT_RADIUS, Simulator
 from recorder.world import WorldOptions, draw_world
+
+STORE = get_typestore(Stores.ROS2_JAZZY)
 
 
 def prim_record(*arguments: object) -> int:
@@ -171,7 +173,8 @@ def test_the_log_describes_itself(quiet_session: Session) -> None:
     assert json.loads(described["lidar"])["noise_std"] == 0.0
     assert World.from_json(json.loads(world or b"")) == quiet_session.world
     texts = [
-        json.loads(marker.text) for marker in decode_message("visualization_msgs/msg/MarkerArray", markers).markers
+        json.loads(marker.text)
+        for marker in STORE.deserialize_cdr(markers, "visualization_msgs/msg/MarkerArray").markers
     ]
     assert sorted(text["kind"] for text in texts if "kind" in text) == sorted(Kind)
 

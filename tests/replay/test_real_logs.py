@@ -10,7 +10,7 @@ import pytest
 
 from prim import console
 from prim.frames import Pose2D
-from prim.shapes import FloatArray
+from prim.raycast import FloatArray
 from replay.cli import app
 from replay.pipeline import Pipeline, ReplayOptions, ReplayResult
 

@@ -1,0 +1,74 @@
+"""Reading CDR, the bytes of ROS 2 messages: a cursor that knows alignment and where the message ends."""
+
+from __future__ import annotations
+
+import struct
+
+import numpy as np
+from numpy.typing import NDArray
+
+SECOND = 1_000_000_000
+
+
+class CdrError(ValueError):
+    """Bytes that are not the message that they should be."""
+
+
+class CdrReader:
+    """Reads the fields of one message in their order, either byte order. Raises CdrError past its end."""
+
+    __slots__ = ("_at", "_data", "_order")
+
+    def __init__(self, data: bytes) -> None:
+        if len(data) < 4 or data[0] != 0 or data[1] not in (0, 1):
+            raise CdrError("not plain CDR: its encapsulation header is " + (bytes(data[:4]).hex(" ") or "missing"))
+        self._data = data
+        self._order = "<" if data[1] else ">"
+        self._at = 4
+
+    def unpack(self, form: str, size: int) -> tuple[float, ...]:
+        """Fields of one ``size`` (bytes), by struct's letters; alignment counts from behind the encapsulation."""
+        at = self._at + (4 - self._at) % size
+        try:
+            values = struct.unpack_from(self._order + form, self._data, at)
+        except struct.error:
+            raise CdrError(f"it ends at byte {len(self._data)}, within its fields at byte {at}") from None
+        self._at = at + size * len(values)
+        return values
+
+    def length(self, item_size: int) -> int:
+        """The length field of a string or sequence, held against the bytes that are there."""
+        count = int(self.unpack("I", 4)[0])
+        if count * item_size > len(self._data) - self._at:
+            raise CdrError(f"it claims {count} items at byte {self._at} of {len(self._data)}")
+        return count
+
+    def string(self) -> str:
+        """A string, its closing NUL left off."""
+        count = self.length(1)
+        start, self._at = self._at, self._at + count
+        try:
+            return bytes(self._data[start : start + max(count - 1, 0)]).decode()
+        except UnicodeDecodeError as error:
+            raise CdrError(f"a string at byte {start} is not text: {error.reason}") from None
+
+    def floats(self) -> NDArray[np.float32]:
+        """A sequence of float32, copied."""
+        count = self.length(4)
+        start, self._at = self._at, self._at + 4 * count
+        return np.frombuffer(self._data, self._order + "f4", count, start).astype(np.float32)
+
+    def skip(self, item_size: int, alignment: int) -> None:
+        """Passes over a sequence of items of one size."""
+        count = self.length(item_size)
+        if count:
+            self._at += (4 - self._at) % alignment + count * item_size
+
+    def stamp(self) -> int:
+        """A time in ns."""
+        seconds, nanoseconds = self.unpack("iI", 4)
+        return int(seconds) * SECOND + int(nanoseconds)
+
+    def header(self) -> tuple[int, str]:
+        """A std_msgs/Header: stamp (ns) and frame."""
+        return self.stamp(), self.string()

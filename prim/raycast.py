@@ -1,0 +1,53 @@
+"""Exact distances from a point along rays to segments and ellipses, all rays against all shapes at once."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+FloatArray = NDArray[np.float64]
+
+END_SLACK = 1e-12
+"""A segment reaches this share beyond its ends, so that no ray slips between two that meet."""
+
+
+def cast_segments(origin: tuple[float, float], directions: FloatArray, segments: FloatArray) -> FloatArray:
+    """Distances (N,) from ``origin`` along ``directions`` (N, 2) to the nearest of ``segments`` (M, 4); inf: none.
+
+    Segments are x0, y0, x1, y1 in metres; their ends belong to them. One that a ray runs along is not met.
+    """
+    if not len(segments):
+        return np.full(len(directions), np.inf)
+    along = (segments[:, 2:] - segments[:, :2]).T[:, :, None]
+    towards = (segments[:, :2] - origin).T[:, :, None]
+    dx, dy = directions.T[:, None, :]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        scale = 1.0 / (dx * along[1] - dy * along[0])
+        distance = (towards[0] * along[1] - towards[1] * along[0]) * scale
+        share = (towards[0] * dy - towards[1] * dx) * scale
+        hits = (distance >= 0) & (np.abs(share - 0.5) <= 0.5 + END_SLACK)
+    nearest: FloatArray = np.where(hits, distance, np.inf).min(axis=0)
+    return nearest
+
+
+def cast_ellipses(origin: tuple[float, float], directions: FloatArray, ellipses: FloatArray) -> FloatArray:
+    """As cast_segments, to the nearest of ``ellipses`` (M, 5): centre x, y, theta, and the semi-axes along it.
+
+    From inside an ellipse it is the distance to its outline.
+    """
+    if not len(ellipses):
+        return np.full(len(directions), np.inf)
+    x, y, theta, a, b = ellipses.T[:, :, None]
+    cos, sin = np.cos(theta), np.sin(theta)
+    ox, oy = origin[0] - x, origin[1] - y
+    px, py = (cos * ox + sin * oy) / a, (cos * oy - sin * ox) / b
+    dx, dy = directions.T[:, None, :]
+    ux, uy = (cos * dx + sin * dy) / a, (cos * dy - sin * dx) / b
+    square = ux * ux + uy * uy
+    half = ux * px + uy * py
+    beyond = px * px + py * py - 1.0
+    discriminant = half * half - square * beyond
+    root = np.sqrt(np.maximum(discriminant, 0.0))
+    distance = (np.where(beyond > 0, -root, root) - half) / square
+    nearest: FloatArray = np.where((discriminant >= 0) & (distance >= 0), distance, np.inf).min(axis=0)
+    return nearest
