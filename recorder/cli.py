@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import sys
 from collections import Counter
+from collections.abc import Mapping
 from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -28,6 +29,7 @@ class MotionName(StrEnum):
     """The ways the robot moves."""
 
     WARP = "warp"
+    DRIVE = "drive"
 
 
 app = typer.Typer(add_completion=False, rich_markup_mode=None)
@@ -52,8 +54,20 @@ def record(
     ] = "0-2",
     motion: Annotated[MotionName, typer.Option(help="How the robot moves.")] = MotionName.WARP,
     stops: Annotated[
-        tuple[int, int], typer.Option(metavar="COLS ROWS", help="The grid of places the robot is warped to.")
-    ] = (10, 10),
+        tuple[int, int] | None,
+        typer.Option(metavar="COLS ROWS", help="The grid of places it is warped to. [default: 10 10]"),
+    ] = None,
+    duration: Annotated[
+        float | None, typer.Option(metavar="S", help="How long it drives, seconds. [default: 60]")
+    ] = None,
+    speed: Annotated[
+        float | None, typer.Option(metavar="M/S", help="How fast it drives, metres per second. [default: 0.2]")
+    ] = None,
+    movable: Annotated[bool, typer.Option("--movable", help="A driving robot can push the primitives.")] = False,
+    odom_noise: Annotated[
+        tuple[float, float] | None,
+        typer.Option(metavar="M DEG", help="Odometry's std after a metre of driving. [default: 0.05 2]"),
+    ] = None,
     rate: Annotated[float, typer.Option(help="Scans per second.")] = 10.0,
     rays: Annotated[int, typer.Option(min=1, help="Beams in a scan.")] = 500,
     fov: Annotated[float, typer.Option(help="Field of view, degrees.")] = round(math.degrees(6.28), 4),
@@ -74,6 +88,7 @@ def record(
     ] = False,
 ) -> int:
     """Record a simulated session of a robot with a 2D LiDAR to an MCAP log."""
+    from recorder.odometry import OdometryNoise
     from recorder.sensors import Compass, Gps, Lidar
     from recorder.session import SessionOptions
     from recorder.session import record as record_session
@@ -83,7 +98,7 @@ def record(
     if world is not None and drawn:
         raise UsageError("--world excludes --size, --no-walls, --kinds and --per-kind: the file says it all")
     _check_positive(
-        {"--size": min(size), "--rate": rate, "--fov": fov, "--range-max": range_max, "--stops": min(stops)}
+        {"--size": min(size), "--rate": rate, "--fov": fov, "--range-max": range_max, "--stops": min(stops or (1,))}
     )
     _check_not_negative({"--range-min": range_min, "--gps-noise": gps_noise, "--compass-noise": compass_noise})
     if range_min >= range_max:
@@ -94,16 +109,25 @@ def record(
         raise UsageError("--range-max and --size must not be above 1000000 m")
     if fov > 360:
         raise UsageError(f"--fov {fov:g} is more than a full turn of 360 degrees")
+    drives = {"--duration": duration, "--speed": speed, "--movable": movable or None, "--odom-noise": odom_noise}
+    _check_motion(motion, drives, {"--stops": stops})
+    drift = odom_noise or (0.05, 2.0)
+    _check_positive({"--duration": 1.0 if duration is None else duration, "--speed": 1.0 if speed is None else speed})
+    _check_not_negative({"--odom-noise": min(drift)})
     options = SessionOptions(
         seed=seed,
         world=WorldOptions(size, _kinds(kinds), _per_kind(per_kind), walls),
         world_file=world,
         motion=motion.value,
-        stops=stops,
+        stops=stops or (10, 10),
+        duration=duration or 60.0,
+        speed=speed or 0.2,
+        movable=movable,
         rate=rate,
         lidar=Lidar(rays, _fov_radians(fov), range_min, range_max, _noise_std(noise, noise_std)),
         gps=Gps(gps_noise),
         compass=Compass(math.radians(compass_noise)),
+        odometry=OdometryNoise(drift[0], math.radians(drift[1])),
     )
     session = record_session(output, options)
     if not quiet:
@@ -145,6 +169,14 @@ def _noise_std(noise: float | None, noise_std: float | None) -> float:
     if noise is not None:
         return noise * PAPER_NOISE_UNIT
     return 0.05 if noise_std is None else noise_std
+
+
+def _check_motion(motion: MotionName, drives: Mapping[str, object], warps: Mapping[str, object]) -> None:
+    """Raises UsageError for an option that goes with the other motion."""
+    other = warps if motion is MotionName.DRIVE else drives
+    given = [name for name, value in other.items() if value is not None]
+    if given:
+        raise UsageError(f"{given[0]} does not go with --motion {motion.value}")
 
 
 def _check_positive(values: dict[str, float]) -> None:
