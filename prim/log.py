@@ -14,7 +14,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import IO, NamedTuple, TypeVar
 
-from mcap.data_stream import ReadDataStream
+from mcap.data_stream import ReadDataStream, RecordBuilder
 from mcap.exceptions import EndOfFile, InvalidMagic, McapError, RecordLengthLimitExceeded
 from mcap.opcode import Opcode
 from mcap.reader import SeekingReader
@@ -27,7 +27,9 @@ from prim.errors import InterruptedRecordingError, LogReadError, OutputError
 from prim.messages import message_definition
 
 MAGIC = b"\x89MCAP0\r\n"
-CHUNK_BYTES = 256 * 1024
+CHUNK_BYTES, CHUNK_MESSAGES = 256 * 1024, 600
+"""A chunk ends when it holds this much; the recorder fills one in a fraction of a second."""
+
 FOOTER_BYTES = 1 + 8 + 8 + 8 + 4 + len(MAGIC)
 RECORD_LIMIT = 1 << 30
 """No record of a readable log is larger (bytes); a length beyond it is damage."""
@@ -119,13 +121,23 @@ class LogReader:
     def attachment(self, name: str) -> bytes | None:
         """An attachment's bytes, None where the log has none of that name. Raises LogReadError."""
         with _explained(self.path):
-            if self._summary is None:
-                records = self._records([])
-                found = (r for r in records if isinstance(r, Attachment) and r.name == name)
-                return next((record.data for record in found), None)
-            for place in self._summary.attachment_indexes:
-                if place.name == name:
-                    return _record_at(self._file, place.offset, Attachment).data
+            found = self._find_attachment(name)
+            if found is None or _crc_fits(found, self._file):
+                return found.data if found else None
+        what = f"the CRC of its attachment {name} does not fit"
+        if not self.recover:
+            raise LogReadError(self.path, f"damaged: {what}", _SALVAGE)
+        self.lost.append(what)
+        return None
+
+    def _find_attachment(self, name: str) -> Attachment | None:
+        """The attachment, with the file standing where its record ends."""
+        if self._summary is None:
+            found = (r for r in self._linear_records([]) if isinstance(r, Attachment) and r.name == name)
+            return next(found, None)
+        for place in self._summary.attachment_indexes:
+            if place.name == name:
+                return _record_at(self._file, place.offset, Attachment)
         return None
 
     @property
@@ -247,10 +259,10 @@ class LogReader:
             with suppress(LogReadError), _explained(self.path):
                 contents.metadata.update(self._indexed_metadata(self._summary))
         for record in self._records(self.lost):
-            if isinstance(record, Channel):
-                contents.channels[record.id] = record
+            if isinstance(record, Channel):  # the first one counts: it lies in a chunk, whose CRC was checked
+                contents.channels.setdefault(record.id, record)
             elif isinstance(record, Schema):
-                contents.schemas[record.id] = record
+                contents.schemas.setdefault(record.id, record)
             elif isinstance(record, McapMessage):
                 contents.counts[record.channel_id] += 1
             elif isinstance(record, Metadata):
@@ -332,8 +344,10 @@ def resolve_log(path: Path) -> Path:
 class LogWriter:
     """Writes a ROS 2 MCAP log: chunked, zstd, CRCs on.
 
-    Until it is closed the log lies beside ``path`` with ``.part`` at its end, and what has been flushed of it
-    can be read with ``--recover``. Raises OutputError where the place cannot be written.
+    Until it is closed the log lies beside ``path`` with ``.part`` at its end. Every chunk is handed to the operating
+    system when it ends, and chunks are small, so that a recorder that is killed loses the last fraction of a second
+    and the rest can be read with ``--recover``. Where a chunk ends depends on the messages and not on the time, so
+    that the same messages make the same bytes. Raises OutputError where the place cannot be written.
     """
 
     def __init__(self, path: Path) -> None:
@@ -347,9 +361,10 @@ class LogWriter:
             raise OutputError(path, error) from error
         from mcap.writer import CompressionType, Writer  # when it is needed: a replay starts faster
 
-        self._writer = Writer(self._file, chunk_size=CHUNK_BYTES, compression=CompressionType.ZSTD, enable_crcs=True)
+        self._writer = Writer(self._file, chunk_size=1 << 40, compression=CompressionType.ZSTD, enable_crcs=True)
         self._writer.start(profile="ros2", library="prim")
         self._channels: dict[str, int] = {}
+        self._messages_in_chunk, self._bytes_in_chunk = 0, 0
 
     def __enter__(self) -> LogWriter:
         return self
@@ -390,12 +405,18 @@ class LogWriter:
         """Writes one CDR message, logged and published at ``stamp`` (ns)."""
         try:
             self._writer.add_message(self._channels[topic], stamp, data, stamp)
+            self._messages_in_chunk += 1
+            self._bytes_in_chunk += len(data)
+            if self._messages_in_chunk >= CHUNK_MESSAGES or self._bytes_in_chunk >= CHUNK_BYTES:
+                self.flush()
         except OSError as error:
             raise OutputError(self.path, error) from error
 
     def flush(self) -> None:
-        """Hands all finished chunks to the operating system."""
+        """Ends the chunk that is being written and hands all there is to the operating system."""
+        self._writer._Writer__finalize_chunk()  # type: ignore[attr-defined]  # nothing public ends a chunk
         self._file.flush()
+        self._messages_in_chunk, self._bytes_in_chunk = 0, 0
 
 
 _LATCHED_QOS = """\
@@ -452,6 +473,15 @@ def _record_at(stream: IO[bytes], offset: int, kind: type[Record]) -> Record:
     if not isinstance(record, kind):
         raise McapError(f"no {kind.__name__} at byte {offset}")
     return record
+
+
+def _crc_fits(attachment: Attachment, stream: IO[bytes]) -> bool:
+    """Whether an attachment is as it was written; ``stream`` stands behind its record, which ends in its CRC."""
+    stream.seek(-4, os.SEEK_CUR)
+    stored = stream.read(4)
+    builder = RecordBuilder()
+    attachment.write(builder)
+    return stored in (b"\0\0\0\0", builder.end()[-4:])  # type: ignore[no-untyped-call]
 
 
 @contextmanager

@@ -31,6 +31,12 @@ TYRE_FRICTION = 0.9
 FLOOR_FRICTION = 0.15
 CONTACT_FRICTION = 0.3
 
+OVERLAP, OVERLAP_AFTER_A_SECOND = 1e-4, 1e-12
+"""Bodies in contact may overlap by this much (m); of a larger overlap this share remains after a second.
+
+pymunk's own values are made for pixels: with them the robot sinks into walls by centimetres.
+"""
+
 STEP = 0.005
 """Seconds per step of the simulation."""
 
@@ -47,6 +53,7 @@ class Simulator:
         self.world = world
         self.space = pymunk.Space()
         self.space.iterations = 20
+        self.space.collision_slop, self.space.collision_bias = OVERLAP, OVERLAP_AFTER_A_SECOND
         self._bodies = [self._add_primitive(primitive, movable) for primitive in world.primitives]
         for x0, y0, x1, y1 in world.walls:
             wall = pymunk.Segment(self.space.static_body, (x0, y0), (x1, y1), 0.0)

@@ -15,12 +15,12 @@ from mapping.grid import GridFrame, OccupancyGrid
 from mapping.mapper import Mapper, make_mapper
 from mapping.rays import end_extent
 from mapping.truth import TruthMap
-from prim.errors import LogReadError, UsageError
+from prim.errors import LogReadError, UsageError, WorldError
 from prim.frames import Pose2D, Scan
 from prim.log import LogReader
 from prim.metrics import MapScores, pose_rmse
 from prim.shapes import angle_difference
-from prim.world import Bounds
+from prim.world import Bounds, World
 from replay.localize import STILL, LaserPoses, Localizer
 from replay.scans import ScanLog, Selection, counted, turned_over
 from replay.show import NullViewer, Scene, Viewer
@@ -172,10 +172,9 @@ class Pipeline:
             frame = self._frame(scans, poses, truth)
             mapper = make_mapper(self.options.mapper, self.options.resolution, frame.bounds)
             judge = Judge(frame, truth, poses, true_poses)
-            world = truth.world if truth else None
-            scene = Scene(log.path.name, self.options.mapper, frame.bounds, world, judge.compares_poses)
+            scene = Scene(log.path.name, self.options.mapper, frame.bounds, judge.scores_maps, judge.compares_poses)
             self._begin(log, scans, poses, scene)
-            used = self._map_scans(scans, poses, mapper, judge, self._map_every(len(scans), frame))
+            used = self._map_scans(scans, poses, mapper, judge, truth, self._map_every(len(scans), frame))
             with self._clock.stage("map"):
                 grid = mapper.finish()
             scores = judge.score(grid)
@@ -194,8 +193,8 @@ class Pipeline:
         """The log's true world; a note where it has one that cannot be understood."""
         try:
             return Truth.read(log)
-        except LogReadError as error:
-            self._notes.append(f"the map is not scored: {error.what}")
+        except WorldError as error:
+            self._notes.append(f"the map is not scored: {error}")
             return None
 
     def _localize(self, log: LogReader, scans: ScanLog) -> tuple[LaserPoses, LaserPoses | None]:
@@ -288,10 +287,17 @@ class Pipeline:
             self._notes.append("no ray crosses the map's bounds: all of it is unknown")
 
     def _map_scans(
-        self, scans: ScanLog, poses: LaserPoses, mapper: Mapper, judge: Judge, map_every: int | None
+        self,
+        scans: ScanLog,
+        poses: LaserPoses,
+        mapper: Mapper,
+        judge: Judge,
+        truth: Truth | None,
+        map_every: int | None,
     ) -> Used:
         """Maps, scores and shows scan by scan; returns what was used."""
         used = Used()
+        shown: World | None = None
         pace = Pace(self.options.rate)
         for position, scan, pose in self._posed(scans, poses):
             stamp = int(scans.stamps[position])
@@ -307,6 +313,9 @@ class Pipeline:
                 used.hits + scan.hits.sum(),
             )
             with self._clock.stage("viewer"):
+                if truth is not None and truth.at(stamp) is not shown:
+                    shown = truth.at(stamp)
+                    self.viewer.show_truth(position, stamp, shown)
                 self.viewer.show_scan(position, stamp, pose, scan, seconds)
                 error = judge.pose_error(position)
                 if error is not None:
@@ -357,6 +366,11 @@ class Judge:
         self._poses = poses
         self._true_poses = true_poses
         self._map = TruthMap(frame) if truth is not None and true_poses is not None else None
+
+    @property
+    def scores_maps(self) -> bool:
+        """Whether the map is held against the true world."""
+        return self._map is not None
 
     @property
     def compares_poses(self) -> bool:

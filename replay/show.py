@@ -45,14 +45,13 @@ class ViewerOptions:
 class Scene:
     """What is known before the first scan.
 
-    The log's name, the mapper, the map's bounds (m), the true world where the log has it, and whether the
-    poses are held against true ones.
+    The log's name, the mapper, the map's bounds (m), and whether the map and the poses are held against the truth.
     """
 
     log: str
     mapper: str
     bounds: Bounds
-    world: World | None
+    has_scores: bool
     has_pose_errors: bool
 
 
@@ -66,6 +65,9 @@ class Viewer(Protocol):
 
     def begin(self, scene: Scene) -> None:
         """Sets the scene."""
+
+    def show_truth(self, position: int, stamp: int, world: World) -> None:
+        """The true world from now on."""
 
     def show_scan(self, position: int, stamp: int, pose: Pose2D, scan: Scan, seconds: float) -> None:
         """A scan, the laser's pose in the map frame, and the mapper's seconds for it."""
@@ -92,6 +94,9 @@ class NullViewer:
     shows = False
 
     def begin(self, scene: Scene) -> None:
+        """Nothing."""
+
+    def show_truth(self, position: int, stamp: int, world: World) -> None:
         """Nothing."""
 
     def show_scan(self, position: int, stamp: int, pose: Pose2D, scan: Scan, seconds: float) -> None:

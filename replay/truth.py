@@ -6,7 +6,7 @@ import bisect
 import json
 from dataclasses import replace
 
-from prim.errors import LogReadError
+from prim.errors import WorldError
 from prim.log import LogReader
 from prim.messages import MARKERS_TYPE, TRUE_PRIMITIVES_TOPIC, decode_primitives
 from prim.world import World
@@ -22,14 +22,17 @@ class Truth:
 
     @classmethod
     def read(cls, log: LogReader) -> Truth | None:
-        """The log's truth, None where it holds none. Raises LogReadError where it cannot be understood."""
+        """The log's truth, None where it holds none.
+
+        Raises WorldError where it does not describe a world, and LogReadError where the log is damaged.
+        """
         attachment = log.attachment("world.json")
         if attachment is None:
             return None
         try:
             world = World.from_json(json.loads(attachment))
         except ValueError as error:
-            raise LogReadError(log.path, f"its world.json does not describe a world: {error}") from error
+            raise WorldError(f"its world.json does not describe a world: {error}") from error
         topic = log.topics.get(TRUE_PRIMITIVES_TOPIC)
         if topic is None or topic.type != MARKERS_TYPE or not topic.messages:
             return cls(world, [])

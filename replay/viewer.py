@@ -93,7 +93,7 @@ class RerunViewer:
         self._styled: set[str] = set()
 
     def begin(self, scene: Scene) -> None:
-        """Opens the recording; sends the layout, the names and colours of the series, and the true world."""
+        """Opens the recording; sends the layout, and the names and colours of the series."""
         self._open_sinks()
         x0, y0, x1, y1 = scene.bounds
         self._size = max(x1 - x0, y1 - y0)
@@ -104,8 +104,23 @@ class RerunViewer:
         self._name_series("pose_error/position", [("position, mm", (86, 180, 233))])
         self._name_series("pose_error/heading", [("heading, degrees", (230, 159, 0))])
         self._name_series("timing", [("mapping, ms a scan", (86, 180, 233))])
-        if scene.world is not None:
-            self._send_truth(scene.world)
+
+    def show_truth(self, position: int, stamp: int, world: World) -> None:
+        """The outlines of the true world from now on."""
+        self._send_batch()
+        self._at(position, stamp)
+        rings = [np.vstack((ring := primitive.outline(64), ring[:1])) for primitive in world.primitives]
+        outlines = [self._lifted(ring, TRUTH_LIFT) for ring in rings]
+        labels = [str(primitive.kind) for primitive in world.primitives]
+        radius = rr.Radius.ui_points(1.0)
+        if outlines:
+            self._recording.log(
+                "map/truth/primitives",
+                rr.LineStrips3D(outlines, labels=labels, show_labels=False, colors=[TRUTH_COLOR], radii=radius),
+            )
+        if world.walls:
+            strips = list(self._lifted(np.asarray(world.walls).reshape(-1, 2, 2), TRUTH_LIFT))
+            self._recording.log("map/truth/walls", rr.LineStrips3D(strips, colors=[TRUTH_COLOR], radii=radius))
 
     def show_scan(self, position: int, stamp: int, pose: Pose2D, scan: Scan, seconds: float) -> None:
         """A scan, the laser's pose in the map frame, and the mapper's seconds for it."""
@@ -192,20 +207,6 @@ class RerunViewer:
         height = np.full((*points.shape[:-1], 1), lift * self._size)
         return np.concatenate((points, height), axis=-1)
 
-    def _send_truth(self, world: World) -> None:
-        rings = [np.vstack((ring := primitive.outline(64), ring[:1])) for primitive in world.primitives]
-        outlines = [self._lifted(ring, TRUTH_LIFT) for ring in rings]
-        labels = [str(primitive.kind) for primitive in world.primitives]
-        radius = rr.Radius.ui_points(1.0)
-        if outlines:
-            self._static(
-                "map/truth/primitives",
-                rr.LineStrips3D(outlines, labels=labels, show_labels=False, colors=[TRUTH_COLOR], radii=radius),
-            )
-        if world.walls:
-            strips = list(self._lifted(np.asarray(world.walls).reshape(-1, 2, 2), TRUTH_LIFT))
-            self._static("map/truth/walls", rr.LineStrips3D(strips, colors=[TRUTH_COLOR], radii=radius))
-
     def _send_batch(self) -> None:
         """Sends the gathered scans as columns: one call for all instead of one for each."""
         entries, self._batch = self._batch, []
@@ -284,7 +285,7 @@ def _blueprint(scene: Scene) -> rrb.Blueprint:
         background=(235, 235, 235, 255),
     )
     right: list[Any] = [rrb.TextDocumentView(origin="summary", name="Result")]
-    if scene.world is not None:
+    if scene.has_scores:
         unit = rrb.ScalarAxis(range=(0.0, 1.02), zoom_lock=True)
         right.append(_series("scores", "Map accuracy", axis_y=unit))
     if scene.has_pose_errors:
