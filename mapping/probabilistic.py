@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapping.grid import Layer, OccupancyGrid
-from mapping.rays import add_log_odds, end_extent
+from mapping.rays import MARGIN_CELLS, add_log_odds, end_extent
 from prim.frames import Pose2D, Scan
 from prim.raycast import FloatArray
 from prim.world import Bounds
@@ -18,7 +18,8 @@ HIT_PROBABILITY = 0.9
 REACH = 0.03
 """Eq. 4's model ends this far (m) before and behind the measured range."""
 
-_TABLE_STEPS = 300
+SPACING = REACH / 300
+"""The model is looked up in a table with an entry every so many metres, and linear in between."""
 
 
 def log_odds(probability: FloatArray | float) -> FloatArray:
@@ -57,7 +58,8 @@ class ProbabilisticMapper:
     def __init__(self, resolution: float = 0.01, bounds: Bounds | None = None) -> None:
         self.resolution = resolution
         self._layer = Layer(resolution, bounds, 0.0, np.float32, margin=REACH)
-        distances = np.linspace(-REACH, REACH, 2 * _TABLE_STEPS + 1)
+        steps = math.ceil((REACH + MARGIN_CELLS * resolution) / SPACING)
+        distances = SPACING * np.arange(-steps, steps + 1, dtype=np.float64)
         self._table = log_odds(inverse_sensor_model(distances)).astype(np.float32)
 
     def update(self, scan: Scan, pose: Pose2D) -> None:
@@ -68,7 +70,7 @@ class ProbabilisticMapper:
         layer = self._layer
         if not layer.fixed:
             layer.cover(*end_extent(*rays))
-        add_log_odds(layer.array, layer.frame.row, layer.frame.col, *rays, REACH, self._table)
+        add_log_odds(layer.array, layer.frame.row, layer.frame.col, *rays, REACH, self._table, SPACING)
 
     def grid(self) -> OccupancyGrid:
         """The map so far."""

@@ -34,6 +34,9 @@ HALF = 1 << (SHIFT - 1)
 MAX_STEPS = float(1 << 21)
 """No ray is followed over more cells than this, and no scan is used from farther off the grid."""
 
+MARGIN_CELLS = 4.0
+"""How far beyond its reach (in cells) the table of an inverse sensor model goes on: no centre lies further off."""
+
 SKIPPED, HIT, NO_RETURN = 0, 1, 2
 FREE, OCCUPIED, UNSEEN = 0, 1, 2
 
@@ -189,6 +192,38 @@ def end_extent(
     return first_row, first_col, last_row, last_col
 
 
+@inline
+def lay_lines(
+    ranges: Any, directions: Any, pose: Any, limits: Any, inverse_resolution: float, origin: Any, width: int
+) -> Any:
+    """The line of every ray of a scan, before any is walked: none of them waits for another.
+
+    ``origin`` is the sensor's cell in the plane and in the grid, row and column each; ``width`` the grid's. Returns
+    ``lines`` (N, 7) int64: kind, steps, tilt, major and minor stride, row and column of the end in the grid; and
+    ``beams`` (N, 3): range in use, and direction in the plane.
+    """
+    count = ranges.shape[0]
+    lines = np.empty((count, 7), np.int64)
+    beams = np.empty((count, 3), np.float64)
+    x, y, cos, sin = pose
+    range_min, range_max = limits
+    far = min(range_max, MAX_STEPS / inverse_resolution)
+    plane_row, plane_col, row, col = origin
+    for i in range(count):
+        z = float(ranges[i])
+        kind = classify(z, range_min, range_max)
+        z = min(z, far) if kind != SKIPPED else 0.0
+        u, v = directions[i, 0], directions[i, 1]
+        dx, dy = cos * u - sin * v, sin * u + cos * v
+        cols = cell(x + z * dx, inverse_resolution) - plane_col
+        rows = cell(y + z * dy, inverse_resolution) - plane_row
+        steps, tilt, major, minor = line(rows, cols, width, dx, dy)
+        lines[i, 0], lines[i, 1], lines[i, 2], lines[i, 3], lines[i, 4] = kind, steps, tilt, major, minor
+        lines[i, 5], lines[i, 6] = row + rows, col + cols
+        beams[i, 0], beams[i, 1], beams[i, 2] = z, dx, dy
+    return lines, beams
+
+
 @kernel
 def mark(
     states: Any, row0: int, col0: int, ranges: Any, directions: Any, pose: Any, limits: Any, inverse_resolution: float
@@ -202,27 +237,22 @@ def mark(
     """
     rows, cols = states.shape
     flat = states.reshape(-1)
-    x, y, cos, sin = pose
-    range_min, range_max = limits
-    far = min(range_max, MAX_STEPS / inverse_resolution)
-    row, col = cell(y, inverse_resolution) - row0, cell(x, inverse_resolution) - col0
-    starts_inside = 0 <= row < rows and 0 <= col < cols
-    start = row * cols + col
+    x, y = pose[0], pose[1]
     hits = np.empty(ranges.shape[0], np.int64)
     count = 0
     if not (is_near(x, inverse_resolution, col0, cols) and is_near(y, inverse_resolution, row0, rows)):
         return hits[:0]
-    for i in range(ranges.shape[0]):
-        z = float(ranges[i])
-        kind = classify(z, range_min, range_max)
+    plane_row, plane_col = cell(y, inverse_resolution), cell(x, inverse_resolution)
+    row, col = plane_row - row0, plane_col - col0
+    starts_inside = 0 <= row < rows and 0 <= col < cols
+    start = row * cols + col
+    origin = (plane_row, plane_col, row, col)
+    lines, _ = lay_lines(ranges, directions, pose, limits, inverse_resolution, origin, cols)
+    for i in range(lines.shape[0]):
+        kind, steps, tilt, major = lines[i, 0], lines[i, 1], lines[i, 2], lines[i, 3]
+        minor, end_row, end_col = lines[i, 4], lines[i, 5], lines[i, 6]
         if kind == SKIPPED:
             continue
-        z = min(z, far)
-        u, v = directions[i, 0], directions[i, 1]
-        dx, dy = cos * u - sin * v, sin * u + cos * v
-        end_col = cell(x + z * dx, inverse_resolution) - col0
-        end_row = cell(y + z * dy, inverse_resolution) - row0
-        steps, tilt, major, minor = line(end_row - row, end_col - col, cols, dx, dy)
         first, last = 0, steps
         ends_inside = 0 <= end_row < rows and 0 <= end_col < cols
         if not (starts_inside and ends_inside):
@@ -248,59 +278,64 @@ def add_log_odds(
     inverse_resolution: float,
     reach: float,
     table: Any,
+    spacing: float,
 ) -> None:
     """One scan into a grid of log-odds (Eqs. 3 and 4), one update per ray and cell.
 
-    Arguments as in :func:`mark`, and the inverse sensor model in log-odds: ``table`` (float32) holds it at equal
-    steps from ``reach`` metres before the measured range, where it begins to differ from free, to as far behind
-    it, where it ends in 0.
+    Arguments as in :func:`mark`, and the inverse sensor model in log-odds: ``table`` (float32) holds it every
+    ``spacing`` metres around the measured range. It differs from free and from 0 within ``reach`` of that, and goes
+    on for MARGIN_CELLS cells on both sides.
     """
     rows, cols = log_odds.shape
     flat = log_odds.reshape(-1)
-    x, y, cos, sin = pose
-    range_min, range_max = limits
-    far = min(range_max, MAX_STEPS / inverse_resolution)
+    x, y = pose[0], pose[1]
     resolution = 1 / inverse_resolution
-    row, col = cell(y, inverse_resolution) - row0, cell(x, inverse_resolution) - col0
-    starts_inside = 0 <= row < rows and 0 <= col < cols
-    start = row * cols + col
-    centre_x, centre_y = (col + col0 + 0.5) * resolution - x, (row + row0 + 0.5) * resolution - y
-    scale = (table.shape[0] - 1) / (2 * reach)
+    half, top = np.float32((table.shape[0] - 1) / 2), np.uint32(table.shape[0] - 2)
+    scale = np.float32(1 / spacing)
     if not (is_near(x, inverse_resolution, col0, cols) and is_near(y, inverse_resolution, row0, rows)):
         return
-    for i in range(ranges.shape[0]):
-        z = float(ranges[i])
-        kind = classify(z, range_min, range_max)
+    plane_row, plane_col = cell(y, inverse_resolution), cell(x, inverse_resolution)
+    row, col = plane_row - row0, plane_col - col0
+    starts_inside = 0 <= row < rows and 0 <= col < cols
+    start = row * cols + col
+    centre_x, centre_y = (plane_col + 0.5) * resolution - x, (plane_row + 0.5) * resolution - y
+    origin = (plane_row, plane_col, row, col)
+    lines, beams = lay_lines(ranges, directions, pose, limits, inverse_resolution, origin, cols)
+    for i in range(lines.shape[0]):
+        kind, steps, tilt, major = lines[i, 0], lines[i, 1], lines[i, 2], lines[i, 3]
+        minor, end_row, end_col = lines[i, 4], lines[i, 5], lines[i, 6]
         if kind == SKIPPED:
             continue
-        z = min(z, far)
-        u, v = directions[i, 0], directions[i, 1]
-        dx, dy = cos * u - sin * v, sin * u + cos * v
-        end_col = cell(x + z * dx, inverse_resolution) - col0
-        end_row = cell(y + z * dy, inverse_resolution) - row0
-        steps, tilt, major, minor = line(end_row - row, end_col - col, cols, dx, dy)
-        last = steps
+        z, dx, dy = beams[i, 0], beams[i, 1], beams[i, 2]
         along_x = abs(major) == 1
+        first, last, plain = 0, steps, steps
         if kind == HIT:  # walk on to the cell of the point at z + reach, at the same slope
             beyond = (x + (z + reach) * dx) if along_x else (y + (z + reach) * dy)
-            last = abs(cell(beyond, inverse_resolution) - (col + col0 if along_x else row + row0))
-        first = 0
-        if not starts_inside or not inside(row, col, rows, cols, major, minor, tilt, last):
-            first, last = clip(row, col, rows, cols, major, minor, tilt, last)
-        plain = last
-        if kind == HIT:  # the centres of these cells lie more than the reach before the measured range
+            last = abs(cell(beyond, inverse_resolution) - (plane_col if along_x else plane_row))
+            # the centres of the plain cells lie more than the reach before the measured range
             certain = z - reach - 1.25 * resolution
-            plain = min(last, int(steps * certain / z)) if certain > 0 and steps > 0 else -1
+            plain = int(steps * certain / z) if certain > 0 and steps > 0 else -1
+        if starts_inside and 0 <= end_row < rows and 0 <= end_col < cols:
+            while last > steps and not inside(row, col, rows, cols, major, minor, tilt, last):
+                last -= 1
+        else:
+            first, last = clip(row, col, rows, cols, major, minor, tilt, last)
+        plain = min(plain, last)
         add_line(flat, table[0], start, first, plain, tilt, major, minor)
-        along, across = (centre_x, centre_y) if along_x else (centre_y, centre_x)
-        along_step = resolution if major > 0 else -resolution
-        across_step = resolution if minor > 0 else -resolution
-        for step in range(max(first, plain + 1), last + 1):
+        near = max(first, plain + 1)
+        along_step = np.float32(resolution if major > 0 else -resolution)
+        across_step = np.float32(resolution if minor > 0 else -resolution)
+        along = np.float32(centre_x if along_x else centre_y)
+        across = np.float32(centre_y if along_x else centre_x)
+        shift = half - np.float32(z) * scale
+        for step in range(near, last + 1):
             aside = (step * tilt + HALF) >> SHIFT
-            distance = math.sqrt((along + step * along_step) ** 2 + (across + aside * across_step) ** 2)
-            place = min(max((distance - z + reach) * scale, 0.0), table.shape[0] - 1.000001)
-            index = int(place)
-            odds = table[index] + np.float32(place - index) * (table[index + 1] - table[index])
+            ahead = along + np.float32(step) * along_step
+            sideways = across + np.float32(aside) * across_step
+            place = np.sqrt(ahead * ahead + sideways * sideways) * scale + shift
+            index = min(np.uint32(np.int32(place)), top)
+            here = table[index]
+            odds = here + (place - np.float32(np.int32(index))) * (table[index + np.uint32(1)] - here)
             flat[np.uintp(start + step * major + aside * minor)] += odds
 
 

@@ -10,6 +10,7 @@ from collections import Counter
 from collections.abc import Callable, Container, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
+from itertools import pairwise
 from pathlib import Path
 from types import TracebackType
 from typing import IO, NamedTuple, TypeVar
@@ -20,7 +21,7 @@ from mcap.opcode import Opcode
 from mcap.reader import SeekingReader
 from mcap.records import Attachment, Channel, Chunk, McapRecord, Metadata, Schema
 from mcap.records import Message as McapMessage
-from mcap.stream_reader import CRCValidationError, StreamReader, breakup_chunk
+from mcap.stream_reader import CRCValidationError, StreamReader, breakup_chunk, get_chunk_data_stream
 from mcap.summary import Summary
 
 from prim.errors import InterruptedRecordingError, LogReadError, OutputError
@@ -40,6 +41,11 @@ _OTHER_FORMATS = (
     (b"\x89PNG", "a PNG image", "give an .mcap log"),
     (b"RRF2", "a rerun recording", "open it with: rerun FILE"),
 )
+_RECORD = struct.Struct("<BQ")
+"""What every record begins with: opcode and length."""
+_MESSAGE = struct.Struct("<HIQQ")
+"""What a message record begins with: channel, sequence, log time, publish time."""
+
 _SALVAGE = "read what is left of it with --recover"
 
 Decoded = TypeVar("Decoded")
@@ -162,13 +168,29 @@ class LogReader:
             return
         delivered: Counter[str] = Counter()
         with _explained(self.path):
-            for _, channel, message in self._index.iter_messages(topics):
-                delivered[channel.topic] += 1
-                yield Message(channel.topic, message.log_time, message.data)
+            for message in self._indexed_messages(self._summary, topics):
+                delivered[message.topic] += 1
+                yield message
         for name in topics:
             if name in self.topics and delivered[name] != self.topics[name].messages:
                 what = f"{name} has {delivered[name]} messages where the summary counts {self.topics[name].messages}"
                 raise LogReadError(self.path, f"damaged: {what}", _SALVAGE)
+
+    def _indexed_messages(self, summary: Summary, topics: tuple[str, ...]) -> Iterator[Message]:
+        """Messages in the order of log times, by the index of chunks."""
+        chunks = sorted(summary.chunk_indexes, key=lambda index: index.message_start_time)
+        if any(a.message_end_time > b.message_start_time for a, b in pairwise(chunks)):
+            for _, channel, message in self._index.iter_messages(topics):  # chunks that overlap must be merged
+                yield Message(channel.topic, message.log_time, message.data)
+            return
+        wanted = {number: channel.topic for number, channel in summary.channels.items() if channel.topic in topics}
+        for index in chunks:
+            if index.message_index_offsets and wanted.keys().isdisjoint(index.message_index_offsets):
+                continue
+            self._file.seek(index.chunk_start_offset + 1 + 8)
+            chunk = Chunk.read(ReadDataStream(self._file))
+            stream, length = get_chunk_data_stream(chunk, validate_crc=True)
+            yield from sorted(_chunk_messages(stream.read(length), wanted), key=lambda message: message.log_time)
 
     def decoded(self, topic: Topic, decode: Callable[[bytes], Decoded]) -> Iterator[tuple[int, Decoded]]:
         """Log time (ns) and decoded message of one topic. Raises LogReadError on messages that do not decode."""
@@ -475,6 +497,21 @@ def _record_at(stream: IO[bytes], offset: int, kind: type[Record]) -> Record:
     return record
 
 
+def _chunk_messages(data: bytes, wanted: Mapping[int, str]) -> Iterator[Message]:
+    """The messages of the wanted channels (by number) among a chunk's records."""
+    at, end = 0, len(data)
+    while at < end:
+        opcode, length = _RECORD.unpack_from(data, at)
+        at += _RECORD.size
+        if at + length > end:
+            raise EndOfFile
+        if opcode == Opcode.MESSAGE:
+            channel, _, log_time, _ = _MESSAGE.unpack_from(data, at)
+            if channel in wanted:
+                yield Message(wanted[channel], log_time, data[at + _MESSAGE.size : at + length])
+        at += length
+
+
 def _crc_fits(attachment: Attachment, stream: IO[bytes]) -> bool:
     """Whether an attachment is as it was written; ``stream`` stands behind its record, which ends in its CRC."""
     stream.seek(-4, os.SEEK_CUR)
@@ -489,7 +526,7 @@ def _explained(path: Path) -> Iterator[None]:
     """Turns everything that mcap and its codecs raise on damaged files into a LogReadError."""
     try:
         yield
-    except LogReadError:
+    except (LogReadError, AttributeError, NameError):  # the latter two would be our own mistakes
         raise
     except CRCValidationError as error:
         raise LogReadError(
