@@ -7,7 +7,7 @@ NOISE_STD ?= 0.05
 
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
 
-.PHONY: demo test test-slow bench-maps lint format clean
+.PHONY: demo test test-slow bench bench-maps lint format clean
 
 demo: .venv/installed
 	@mkdir -p demo
@@ -25,8 +25,11 @@ test: lint
 test-slow: .venv/installed-dev
 	$(BIN)/python -m pytest -q -m slow
 
+bench: .venv/installed
+	$(BIN)/python -m bench.speed --update docs/speed.md
+
 bench-maps: .venv/installed
-	$(BIN)/python bench/maps.py --update README.md
+	$(BIN)/python -m bench.maps --update README.md
 
 lint: .venv/installed-dev
 	$(BIN)/ruff check .

@@ -1,6 +1,6 @@
 """Damages a recorded log in many ways and replays each: it must never crash, hang, or pass off other content.
 
-    python bench/fuzz.py [--cuts 200] [--bytes 2000] [--seed 0]
+    python -m bench.fuzz [--cuts 200] [--bytes 2000] [--seed 0]
 
 A cut leaves the first N bytes of the log; a flip changes one byte, half of them in places where length fields stand.
 Each damaged log is replayed, and once more with --recover. What is wrong: a traceback or a signal, an error of more

@@ -1,6 +1,6 @@
 """How good each mapper's maps are, per noise level: recorded sessions, the median of each score.
 
-    python bench/maps.py [--sessions 20] [--mappers det prob] [--update README.md]
+    python -m bench.maps [--sessions 20] [--mappers det prob] [--update README.md]
 
 Seeds 0, 1, ... are the sessions'; a session with another noise level has the same world and the same poses.
 """

@@ -1,9 +1,9 @@
 """How fast prim is, beside a peer where there is one, in turns within one run: absolute times drift, ratios hardly.
 
-    python bench/speed.py [--rounds 5] [--peers ../shared/peers] [--update docs/speed.md]
+    python -m bench.speed [--rounds 5] [--peers ../shared/peers] [--update docs/speed.md]
 
 The peer is MRPT's COccupancyGridMap2D::insertObservation (Debian: libmrpt-maps-dev, cmake, g++), built in a scratch
-folder from the peers' sources; without them its rows are left out. Everything runs on one core.
+folder from the peers' sources; without them its rows are left out. Mapping runs on one core, whole commands on all.
 """
 
 from __future__ import annotations
@@ -19,12 +19,13 @@ import sys
 import tempfile
 import time
 from collections import defaultdict
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
-from maps import update
 
+from bench.maps import update
 from mapping.mapper import make_mapper
 from prim.frames import Pose2D, Scan
 from prim.log import LogReader, LogWriter
@@ -59,6 +60,17 @@ def seconds(work: Callable[[], object]) -> float:
     began = time.perf_counter()
     work()
     return time.perf_counter() - began
+
+
+@contextmanager
+def one_core() -> Iterator[None]:
+    """Holds this process, and those that it starts, to one core."""
+    cores = os.sched_getaffinity(0)
+    os.sched_setaffinity(0, {min(cores)})
+    try:
+        yield
+    finally:
+        os.sched_setaffinity(0, cores)
 
 
 def mapping_rate(name: str, scans: list[Scan], poses: list[Pose2D]) -> float:
@@ -147,10 +159,11 @@ def measure(rounds: int, peer: Path | None, folder: Path) -> Rows:
     record(session, SessionOptions(seed=10))
     replay = BIN / "prim-replay"
     for _ in range(rounds):
-        if peer:
-            rows["mrpt"].append(peer_rate(peer))
-        for name in ("det", "prob"):
-            rows[name].append(mapping_rate(name, scans, poses))
+        with one_core():
+            if peer:
+                rows["mrpt"].append(peer_rate(peer))
+            for name in ("det", "prob"):
+                rows[name].append(mapping_rate(name, scans, poses))
         rows["reading"].append(reading_rate(folder / "read.mcap"))
         for motion in ("warp", "drive"):
             rows[f"recording {motion}"].append(recording_rate(folder, motion, 60.0))
@@ -209,7 +222,6 @@ def main() -> None:
     parser.add_argument("--peers", type=Path, default=Path(__file__).parents[2] / "shared" / "peers")
     parser.add_argument("--update", type=Path)
     options = parser.parse_args()
-    os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})
     sys.path.insert(0, str(options.peers))
     with tempfile.TemporaryDirectory() as scratch:
         peer = build_peer(options.peers, Path(scratch))

@@ -321,9 +321,10 @@ class Pipeline:
                 if error is not None:
                     self.viewer.show_pose_error(position, stamp, *error)
             if map_every and position % map_every == 0:
+                grid = mapper.grid()
+                scores = judge.score(grid)
                 with self._clock.stage("viewer"):
-                    grid = mapper.grid()
-                    self.viewer.show_map(position, stamp, grid, judge.score(grid))
+                    self.viewer.show_map(position, stamp, grid, scores)
             self._progress(position + 1, len(scans))
         return used
 

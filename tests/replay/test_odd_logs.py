@@ -194,3 +194,32 @@ def test_other_encodings_are_named(replay: Replay, encoding: str) -> None:
         writer.finish()
     code, err, _ = replay("a.mcap", "--standing-still")
     assert (code, repr(encoding) in err, err.count("\n")) == (1, True, 1)
+
+
+def test_damaged_logs_never_pass_for_whole_ones(tmp_path: Path) -> None:
+    """A bounded form of bench.fuzz, with other seeds each in their own way: cuts and flipped bytes."""
+    from bench.fuzz import fuzz
+
+    codes, wrong = fuzz(tmp_path, cuts=15, flips=60, seed=1)
+    assert wrong == []
+    assert codes["exit 0"] > 0 and codes["exit 1"] > 0 and codes["exit 3 recovering"] > 0
+
+
+def test_messages_come_in_the_order_of_their_times_even_where_chunks_overlap(tmp_path: Path) -> None:
+    """Two chunks whose times interleave, and one that is not sorted in itself."""
+    from mcap.writer import Writer as PlainWriter
+
+    from prim.log import LogReader
+
+    path = tmp_path / "a.mcap"
+    with path.open("wb") as stream:
+        writer = PlainWriter(stream, chunk_size=1 << 30)
+        writer.start("ros2")
+        channel = writer.register_channel("/scan", "cdr", writer.register_schema(SCAN_TYPE, "ros2msg", b""))
+        for chunk in ((1, 5, 3), (4, 2, 6)):
+            for second in chunk:
+                writer.add_message(channel, second * SECOND, encode_scan(replace(GOOD, stamp=second * SECOND)), 0)
+            writer._Writer__finalize_chunk()
+        writer.finish()
+    with LogReader(path) as log:
+        assert [message.log_time // SECOND for message in log.messages("/scan")] == [1, 2, 3, 4, 5, 6]

@@ -1,0 +1,1 @@
+"""Measurements that anyone can repeat: maps, speed, damaged logs."""
