@@ -37,6 +37,9 @@ MAX_STEPS = float(1 << 21)
 MARGIN_CELLS = 4.0
 """How far beyond its reach (in cells) the table of an inverse sensor model goes on: no centre lies further off."""
 
+BLOCK = 32
+"""Rays whose lines are laid together: few enough for the fastest cache."""
+
 SKIPPED, HIT, NO_RETURN = 0, 1, 2
 FREE, OCCUPIED, UNSEEN = 0, 1, 2
 
@@ -194,26 +197,33 @@ def end_extent(
 
 @inline
 def lay_lines(
-    ranges: Any, directions: Any, pose: Any, limits: Any, inverse_resolution: float, origin: Any, width: int
-) -> Any:
-    """The line of every ray of a scan, before any is walked: none of them waits for another.
+    ranges: Any,
+    directions: Any,
+    pose: Any,
+    limits: Any,
+    inverse_resolution: float,
+    origin: Any,
+    width: int,
+    begin: int,
+    lines: Any,
+    beams: Any,
+) -> int:
+    """The lines of BLOCK rays from ``begin`` on, before any is walked: none of them waits for another.
 
-    ``origin`` is the sensor's cell in the plane and in the grid, row and column each; ``width`` the grid's. Returns
-    ``lines`` (N, 7) int64: kind, steps, tilt, major and minor stride, row and column of the end in the grid; and
-    ``beams`` (N, 3): range in use, and direction in the plane.
+    ``origin`` is the sensor's cell in the plane and in the grid, row and column each; ``width`` the grid's. Fills
+    ``lines`` (BLOCK, 7) int64: kind, steps, tilt, major and minor stride, row and column of the end in the grid; and
+    ``beams`` (BLOCK, 3): range in use, and direction in the plane. Returns how many there are.
     """
-    count = ranges.shape[0]
-    lines = np.empty((count, 7), np.int64)
-    beams = np.empty((count, 3), np.float64)
+    count = min(BLOCK, ranges.shape[0] - begin)
     x, y, cos, sin = pose
     range_min, range_max = limits
     far = min(range_max, MAX_STEPS / inverse_resolution)
     plane_row, plane_col, row, col = origin
     for i in range(count):
-        z = float(ranges[i])
+        z = float(ranges[begin + i])
         kind = classify(z, range_min, range_max)
         z = min(z, far) if kind != SKIPPED else 0.0
-        u, v = directions[i, 0], directions[i, 1]
+        u, v = directions[begin + i, 0], directions[begin + i, 1]
         dx, dy = cos * u - sin * v, sin * u + cos * v
         cols = cell(x + z * dx, inverse_resolution) - plane_col
         rows = cell(y + z * dy, inverse_resolution) - plane_row
@@ -221,7 +231,7 @@ def lay_lines(
         lines[i, 0], lines[i, 1], lines[i, 2], lines[i, 3], lines[i, 4] = kind, steps, tilt, major, minor
         lines[i, 5], lines[i, 6] = row + rows, col + cols
         beams[i, 0], beams[i, 1], beams[i, 2] = z, dx, dy
-    return lines, beams
+    return int(count)
 
 
 @kernel
@@ -247,20 +257,22 @@ def mark(
     starts_inside = 0 <= row < rows and 0 <= col < cols
     start = row * cols + col
     origin = (plane_row, plane_col, row, col)
-    lines, _ = lay_lines(ranges, directions, pose, limits, inverse_resolution, origin, cols)
-    for i in range(lines.shape[0]):
-        kind, steps, tilt, major = lines[i, 0], lines[i, 1], lines[i, 2], lines[i, 3]
-        minor, end_row, end_col = lines[i, 4], lines[i, 5], lines[i, 6]
-        if kind == SKIPPED:
-            continue
-        first, last = 0, steps
-        ends_inside = 0 <= end_row < rows and 0 <= end_col < cols
-        if not (starts_inside and ends_inside):
-            first, last = clip(row, col, rows, cols, major, minor, tilt, steps)
-        set_line(flat, FREE, start, first, last, tilt, major, minor)
-        if kind == HIT and ends_inside:
-            hits[count] = end_row * cols + end_col
-            count += 1
+    lines, beams = np.empty((BLOCK, 7), np.int64), np.empty((BLOCK, 3), np.float64)
+    for begin in range(0, ranges.shape[0], BLOCK):
+        laid = lay_lines(ranges, directions, pose, limits, inverse_resolution, origin, cols, begin, lines, beams)
+        for i in range(laid):
+            kind, steps, tilt, major = lines[i, 0], lines[i, 1], lines[i, 2], lines[i, 3]
+            minor, end_row, end_col = lines[i, 4], lines[i, 5], lines[i, 6]
+            if kind == SKIPPED:
+                continue
+            first, last = 0, steps
+            ends_inside = 0 <= end_row < rows and 0 <= end_col < cols
+            if not (starts_inside and ends_inside):
+                first, last = clip(row, col, rows, cols, major, minor, tilt, steps)
+            set_line(flat, FREE, start, first, last, tilt, major, minor)
+            if kind == HIT and ends_inside:
+                hits[count] = end_row * cols + end_col
+                count += 1
     for i in range(count):
         flat[hits[i]] = OCCUPIED
     return hits[:count]
@@ -290,8 +302,6 @@ def add_log_odds(
     flat = log_odds.reshape(-1)
     x, y = pose[0], pose[1]
     resolution = 1 / inverse_resolution
-    half, top = np.float32((table.shape[0] - 1) / 2), np.uint32(table.shape[0] - 2)
-    scale = np.float32(1 / spacing)
     if not (is_near(x, inverse_resolution, col0, cols) and is_near(y, inverse_resolution, row0, rows)):
         return
     plane_row, plane_col = cell(y, inverse_resolution), cell(x, inverse_resolution)
@@ -300,52 +310,71 @@ def add_log_odds(
     start = row * cols + col
     centre_x, centre_y = (plane_col + 0.5) * resolution - x, (plane_row + 0.5) * resolution - y
     origin = (plane_row, plane_col, row, col)
-    lines, beams = lay_lines(ranges, directions, pose, limits, inverse_resolution, origin, cols)
-    for i in range(lines.shape[0]):
-        kind, steps, tilt, major = lines[i, 0], lines[i, 1], lines[i, 2], lines[i, 3]
-        minor, end_row, end_col = lines[i, 4], lines[i, 5], lines[i, 6]
-        if kind == SKIPPED:
-            continue
-        z, dx, dy = beams[i, 0], beams[i, 1], beams[i, 2]
-        along_x = abs(major) == 1
-        first, last, plain = 0, steps, steps
-        if kind == HIT:  # walk on to the cell of the point at z + reach, at the same slope
-            beyond = (x + (z + reach) * dx) if along_x else (y + (z + reach) * dy)
-            last = abs(cell(beyond, inverse_resolution) - (plane_col if along_x else plane_row))
-            # the centres of the plain cells lie more than the reach before the measured range
-            certain = z - reach - 1.25 * resolution
-            plain = int(steps * certain / z) if certain > 0 and steps > 0 else -1
-        if starts_inside and 0 <= end_row < rows and 0 <= end_col < cols:
-            while last > steps and not inside(row, col, rows, cols, major, minor, tilt, last):
-                last -= 1
-        else:
-            first, last = clip(row, col, rows, cols, major, minor, tilt, last)
-        plain = min(plain, last)
-        add_line(flat, table[0], start, first, plain, tilt, major, minor)
-        near = max(first, plain + 1)
-        along_step = np.float32(resolution if major > 0 else -resolution)
-        across_step = np.float32(resolution if minor > 0 else -resolution)
-        along = np.float32(centre_x if along_x else centre_y)
-        across = np.float32(centre_y if along_x else centre_x)
-        shift = half - np.float32(z) * scale
-        for step in range(near, last + 1):
-            aside = (step * tilt + HALF) >> SHIFT
-            ahead = along + np.float32(step) * along_step
-            sideways = across + np.float32(aside) * across_step
-            place = np.sqrt(ahead * ahead + sideways * sideways) * scale + shift
-            index = min(np.uint32(np.int32(place)), top)
-            here = table[index]
-            odds = here + (place - np.float32(np.int32(index))) * (table[index + np.uint32(1)] - here)
-            flat[np.uintp(start + step * major + aside * minor)] += odds
+    lines, beams = np.empty((BLOCK, 7), np.int64), np.empty((BLOCK, 3), np.float64)
+    for begin in range(0, ranges.shape[0], BLOCK):
+        laid = lay_lines(ranges, directions, pose, limits, inverse_resolution, origin, cols, begin, lines, beams)
+        for i in range(laid):
+            kind, steps, tilt, major = lines[i, 0], lines[i, 1], lines[i, 2], lines[i, 3]
+            minor, end_row, end_col = lines[i, 4], lines[i, 5], lines[i, 6]
+            if kind == SKIPPED:
+                continue
+            z = beams[i, 0]
+            along_x = abs(major) == 1
+            first, last, plain = 0, steps, steps
+            if kind == HIT:  # walk on to the cell of the point at z + reach, at the same slope
+                beyond = (x + (z + reach) * beams[i, 1]) if along_x else (y + (z + reach) * beams[i, 2])
+                last = abs(cell(beyond, inverse_resolution) - (plane_col if along_x else plane_row))
+                plain = surely_free(z - reach - 1.25 * resolution, z, steps)
+            if starts_inside and 0 <= end_row < rows and 0 <= end_col < cols:
+                while last > steps and not inside(row, col, rows, cols, major, minor, tilt, last):
+                    last -= 1
+            else:
+                first, last = clip(row, col, rows, cols, major, minor, tilt, last)
+            plain = min(plain, last)
+            add_line(flat, table[0], start, first, plain, tilt, major, minor)
+            along, across = (centre_x, centre_y) if along_x else (centre_y, centre_x)
+            walked = (start, max(first, plain + 1), last, tilt, major, minor)
+            add_model(flat, walked, along, across, resolution, z, table, spacing)
 
 
 @inline
-def inside(row: int, col: int, rows: int, cols: int, major: int, minor: int, tilt: int, last: int) -> bool:
-    """Whether a line's last step lies within the grid."""
-    along, aside = last, (last * tilt + HALF) >> SHIFT
+def surely_free(certain: float, z: float, steps: int) -> int:
+    """The last step whose cell's centre lies no further than ``certain`` metres, whatever its offset; -1: none."""
+    return int(steps * certain / z) if certain > 0 and steps > 0 else -1
+
+
+@inline
+def add_model(
+    flat: Any, walked: Any, along: float, across: float, resolution: float, z: float, table: Any, spacing: float
+) -> None:
+    """Adds the sensor model to the cells of a line by the distances of their centres, in single precision.
+
+    ``walked`` is the line: flat start, first and last step, tilt, strides; ``along`` and ``across`` are the centre of
+    its first cell from the sensor, metres along the major and the minor axis.
+    """
+    start, first, last, tilt, major, minor = walked
+    middle, top = np.float32((table.shape[0] - 1) / 2), np.uint32(table.shape[0] - 2)
+    scale = np.float32(1 / spacing)
+    shift = middle - np.float32(z) * scale
+    ahead_step = np.float32(resolution if major > 0 else -resolution)
+    aside_step = np.float32(resolution if minor > 0 else -resolution)
+    for step in range(first, last + 1):
+        aside = (step * tilt + HALF) >> SHIFT
+        u = np.float32(along) + np.float32(step) * ahead_step
+        v = np.float32(across) + np.float32(aside) * aside_step
+        place = np.sqrt(u * u + v * v) * scale + shift
+        index = min(np.uint32(np.int32(place)), top)
+        lower = table[index]
+        odds = lower + (place - np.float32(np.int32(index))) * (table[index + np.uint32(1)] - lower)
+        flat[np.uintp(start + step * major + aside * minor)] += odds
+
+
+@inline
+def inside(row: int, col: int, rows: int, cols: int, major: int, minor: int, tilt: int, step: int) -> bool:
+    """Whether a line's step lies within the grid."""
+    aside = (step * tilt + HALF) >> SHIFT
     if abs(major) == 1:
-        along, aside = aside, along
-        row, col = (row + along if minor > 0 else row - along), (col + aside if major > 0 else col - aside)
+        col, row = (col + step if major > 0 else col - step), (row + aside if minor > 0 else row - aside)
     else:
-        row, col = (row + along if major > 0 else row - along), (col + aside if minor > 0 else col - aside)
+        row, col = (row + step if major > 0 else row - step), (col + aside if minor > 0 else col - aside)
     return 0 <= row < rows and 0 <= col < cols
