@@ -96,11 +96,18 @@ class ScanLog:
                 yield positions[index], scan
 
     def notes(self) -> list[str]:
-        """What a user should know of scans that were left out."""
-        if not self.unusable:
-            return []
-        index, problem = min(self.unusable.items())
-        return [f"{counted(len(self.unusable), 'scan')} cannot be used, the first one {index}: {problem}"]
+        """What a user should know of scans that were left out or have odd stamps."""
+        notes = []
+        if self.unusable:
+            index, problem = min(self.unusable.items())
+            notes.append(f"{counted(len(self.unusable), 'scan')} cannot be used, the first one {index}: {problem}")
+        steps = np.diff(self.stamps)
+        if (steps < 0).any():
+            back = counted(int(np.count_nonzero(steps < 0)), "time")
+            notes.append(f"stamps go back {back}: scans are mapped in the order in which they were logged")
+        if (steps == 0).any():
+            notes.append(f"{counted(int(np.count_nonzero(steps == 0)), 'scan')} with the stamp of the one before")
+        return notes
 
     def _read_stamps(self) -> tuple[NDArray[np.intp], Stamps]:
         """Indices and stamps of the scans whose header can be read."""

@@ -101,7 +101,8 @@ def test_a_scan_that_cannot_be_decoded(replay: Replay) -> None:
 
 def test_stamps_that_repeat_or_go_back(replay: Replay) -> None:
     stamps = (3, 2, 2, 1)
-    code, _, report = replay(write(Path("a.mcap"), [replace(GOOD, stamp=stamp * SECOND) for stamp in stamps]))
+    code, err, report = replay(write(Path("a.mcap"), [replace(GOOD, stamp=stamp * SECOND) for stamp in stamps]))
+    assert "stamps go back 2 times" in err and "1 scan with the stamp of the one before" in err
     assert (code, report["log"]["scans_used"], report["log"]["duration_s"]) == (0, 4, 2.0)
 
 
