@@ -206,21 +206,31 @@ def test_damaged_logs_never_pass_for_whole_ones(tmp_path: Path) -> None:
     assert codes["exit 0"] > 0 and codes["exit 1"] > 0 and codes["exit 3 recovering"] > 0
 
 
-def test_messages_come_in_the_order_of_their_times_even_where_chunks_overlap(tmp_path: Path) -> None:
-    """Two chunks whose times interleave, and one that is not sorted in itself."""
-    from mcap.writer import Writer as PlainWriter
-
-    from prim.log import LogReader
-
-    path = tmp_path / "a.mcap"
+def write_chunks(path: Path, *chunks: tuple[int, ...], uncounted: int = 0) -> Path:
+    """A log of scans at these seconds, chunk by chunk, whose summary counts more than there are."""
     with path.open("wb") as stream:
-        writer = PlainWriter(stream, chunk_size=1 << 30)
+        writer = Writer(stream, chunk_size=1 << 30)
         writer.start("ros2")
         channel = writer.register_channel("/scan", "cdr", writer.register_schema(SCAN_TYPE, "ros2msg", b""))
-        for chunk in ((1, 5, 3), (4, 2, 6)):
+        for chunk in chunks:
             for second in chunk:
                 writer.add_message(channel, second * SECOND, encode_scan(replace(GOOD, stamp=second * SECOND)), 0)
             writer._Writer__finalize_chunk()
+        writer._Writer__statistics.channel_message_counts[channel] += uncounted
         writer.finish()
-    with LogReader(path) as log:
+    return path
+
+
+@pytest.mark.parametrize("chunks", [((1, 5, 3), (4, 2, 6)), ((2, 3, 1), (6, 4, 5)), ((4, 5, 6), (1, 2, 3))])
+def test_messages_come_in_the_order_of_their_times(tmp_path: Path, chunks: tuple[tuple[int, ...], ...]) -> None:
+    """Chunks whose times interleave, chunks that are not sorted in themselves, chunks in the other order."""
+    from prim.log import LogReader
+
+    with LogReader(write_chunks(tmp_path / "a.mcap", *chunks)) as log:
         assert [message.log_time // SECOND for message in log.messages("/scan")] == [1, 2, 3, 4, 5, 6]
+
+
+def test_messages_that_the_summary_counts_and_the_log_lacks(replay: Replay) -> None:
+    log = write_chunks(Path("a.mcap"), (1, 2, 3), uncounted=2)
+    code, err, _ = replay(log, "--standing-still")
+    assert (code, "3 messages where the summary counts 5" in err) == (1, True)
