@@ -24,6 +24,7 @@ class DeterministicMapper:
     """
 
     name = "det"
+    noise_std: float | None = None
 
     def __init__(self, resolution: float = 0.01, bounds: Bounds | None = None) -> None:
         self.resolution = resolution

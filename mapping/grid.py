@@ -88,10 +88,14 @@ class GridFrame:
 
 @dataclass(frozen=True, slots=True)
 class OccupancyGrid:
-    """``probability`` (rows, cols) float32 of occupancy, 0.5 where unknown; row 0 at the smallest y."""
+    """``probability`` (rows, cols) float32 of occupancy, 0.5 where unknown; row 0 at the smallest y.
+
+    ``evidence`` (rows, cols) float32, where the mapper has it: how many rays are expected to have come to each cell.
+    """
 
     frame: GridFrame
     probability: NDArray[np.float32]
+    evidence: NDArray[np.float32] | None = None
 
     @property
     def occupied(self) -> NDArray[np.bool_]:

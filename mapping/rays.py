@@ -44,7 +44,7 @@ SKIPPED, HIT, NO_RETURN = 0, 1, 2
 FREE, OCCUPIED, UNSEEN = 0, 1, 2
 
 
-def _compiled(**options: Any) -> Callable[[Kernel], Kernel]:
+def compiled(**options: Any) -> Callable[[Kernel], Kernel]:
     """Numba's compiler; its code is cached where there is a place that can be written."""
 
     def compile_it(function: Kernel) -> Kernel:
@@ -57,8 +57,8 @@ def _compiled(**options: Any) -> Callable[[Kernel], Kernel]:
     return compile_it
 
 
-kernel = _compiled(inline="never")
-inline = _compiled(inline="always")
+kernel = compiled(inline="never")
+inline = compiled(inline="always")
 
 
 @inline

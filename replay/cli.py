@@ -35,6 +35,14 @@ class MapperName(StrEnum):
 
     DET = "det"
     PROB = "prob"
+    FORWARD = "forward"
+
+
+class SensorModelName(StrEnum):
+    """The inverse sensor models of ``prob``."""
+
+    EQ4 = "eq4"
+    GAUSSIAN = "gaussian"
 
 
 class PoseName(StrEnum):
@@ -77,6 +85,15 @@ def replay(
         float | None,
         typer.Option(
             metavar="M", help="Follow beams no further than this, metres. [default: the scanner's range_max]"
+        ),
+    ] = None,
+    sensor_model: Annotated[
+        SensorModelName, typer.Option(help="What prob makes of a range: the paper's Eq. 4, or a Gaussian.")
+    ] = SensorModelName.EQ4,
+    noise_std: Annotated[
+        float | None,
+        typer.Option(
+            metavar="M", help="Standard deviation of the ranges, metres. [default: found from the log, where needed]"
         ),
     ] = None,
     standing_still: Annotated[
@@ -125,6 +142,8 @@ def replay(
     offset = Pose2D(laser_offset[0], laser_offset[1], math.radians(laser_offset[2])) if laser_offset else None
     options = ReplayOptions(
         mapper=mapper.value,
+        sensor_model=sensor_model.value,
+        noise_std=noise_std,
         pose=pose.value,
         resolution=resolution,
         bounds=_parse_bounds(bounds),

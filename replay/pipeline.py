@@ -11,8 +11,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from mapping.forward import find_noise
 from mapping.grid import GridFrame, OccupancyGrid
-from mapping.mapper import Mapper, make_mapper
+from mapping.mapper import Mapper, check_mapper, make_mapper
 from mapping.rays import end_extent
 from mapping.truth import TruthMap
 from prim.errors import LogReadError, UsageError, WorldError
@@ -39,6 +40,9 @@ MAP_FRAMES = 50
 MAP_FRAME_CELLS = 40_000_000
 """By default the map is shown about this often, and no more cells are shown in all."""
 
+NOISE_SCANS = 200
+"""The noise is found from about so many scans, evenly spread over the log, where only the noise is wanted."""
+
 Progress = Callable[[int, int], None]
 
 
@@ -47,6 +51,8 @@ class ReplayOptions:
     """How one log is replayed; lengths in metres, times in seconds. Raises UsageError on impossible values."""
 
     mapper: str = "det"
+    sensor_model: str = "eq4"
+    noise_std: float | None = None
     pose: str = "auto"
     resolution: float = 0.01
     bounds: Bounds | None = None
@@ -61,6 +67,7 @@ class ReplayOptions:
     recover: bool = False
 
     def __post_init__(self) -> None:
+        check_mapper(self.mapper, self.sensor_model, self.noise_std)
         if not (0 < self.resolution < np.inf):
             raise UsageError(f"--resolution is {self.resolution:g}: it must be above 0")
         if self.bounds is not None and not (self.bounds[0] < self.bounds[2] and self.bounds[1] < self.bounds[3]):
@@ -97,6 +104,7 @@ class ReplayResult:
     stamps: NDArray[np.int64]
     pose_rmse: tuple[float, float] | None
     grid: OccupancyGrid
+    noise_std: float | None
     scores: MapScores | None
     seconds: dict[str, float]
 
@@ -170,7 +178,7 @@ class Pipeline:
             with self._clock.stage("localize"):
                 poses, true_poses = self._localize(log, scans)
             frame = self._frame(scans, poses, truth)
-            mapper = make_mapper(self.options.mapper, self.options.resolution, frame.bounds)
+            mapper = self._mapper(scans, poses, frame)
             judge = Judge(frame, truth, poses, true_poses)
             scene = Scene(log.path.name, self.options.mapper, frame.bounds, judge.scores_maps, judge.compares_poses)
             self._begin(log, scans, poses, scene)
@@ -179,7 +187,7 @@ class Pipeline:
                 grid = mapper.finish()
             scores = judge.score(grid)
             self._note_what_was_used(scans, poses, used, grid)
-            result = self._result(log, scans, poses, used, grid, scores, judge)
+            result = self._result(log, scans, poses, used, grid, mapper.noise_std, scores, judge)
             with self._clock.stage("viewer"):
                 last = len(scans) - 1
                 stamp = int(scans.stamps[last])
@@ -236,6 +244,17 @@ class Pipeline:
         row, col = np.min([extent[:2] for extent in extents], axis=0).tolist()
         last_row, last_col = np.max([extent[2:] for extent in extents], axis=0).tolist()
         return GridFrame(self.options.resolution, row, col, last_row - row + 1, last_col - col + 1)
+
+    def _mapper(self, scans: ScanLog, poses: LaserPoses, frame: GridFrame) -> Mapper:
+        """The mapper; where it needs the noise and nobody gave it, the forward model finds it first."""
+        options = self.options
+        noise_std = options.noise_std
+        if options.sensor_model == "gaussian" and noise_std is None:
+            every = -(-len(scans) // NOISE_SCANS)
+            some = [(scan, pose) for position, scan, pose in self._posed(scans, poses) if position % every == 0]
+            with self._clock.stage("map"):
+                noise_std = find_noise(some, frame)
+        return make_mapper(options.mapper, options.resolution, frame.bounds, options.sensor_model, noise_std)
 
     def _posed(self, scans: ScanLog, poses: LaserPoses) -> Iterator[tuple[int, Scan, Pose2D]]:
         """The scans that have a pose: position, scan as seen from above, pose of the laser."""
@@ -307,11 +326,7 @@ class Pipeline:
                 mapper.update(scan, pose)
             seconds = time.perf_counter() - start
             judge.update(position, scan, stamp)
-            used.scans, used.rays, used.hits = (
-                used.scans + 1,
-                used.rays + len(scan.ranges),
-                used.hits + scan.hits.sum(),
-            )
+            used.count(scan)
             with self._clock.stage("viewer"):
                 if truth is not None and truth.at(stamp) is not shown:
                     shown = truth.at(stamp)
@@ -335,6 +350,7 @@ class Pipeline:
         poses: LaserPoses,
         used: Used,
         grid: OccupancyGrid,
+        noise_std: float | None,
         scores: MapScores | None,
         judge: Judge,
     ) -> ReplayResult:
@@ -352,6 +368,7 @@ class Pipeline:
             stamps=scans.stamps,
             pose_rmse=judge.pose_rmse(),
             grid=grid,
+            noise_std=noise_std,
             scores=scores,
             seconds=self._clock.seconds | {"total": self._clock.total()},
         )

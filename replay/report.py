@@ -44,7 +44,8 @@ def report(result: ReplayResult) -> dict[str, Any]:
             "resolution_m": frame.resolution,
             "origin_m": list(frame.origin),
             "cells": [frame.rows, frame.cols],
-            "noise_std_m": None,
+            "noise_std_m": result.noise_std,
+            "evidence": _evidence(result.grid),
             "scores": result.scores.to_json() if result.scores else None,
         },
         "primitives": [],
@@ -55,6 +56,15 @@ def report(result: ReplayResult) -> dict[str, Any]:
             "x_realtime": result.duration / seconds["total"] if seconds["total"] else None,
         },
     }
+
+
+def _evidence(grid: OccupancyGrid) -> dict[str, Any] | None:
+    """How many rays are expected to have come to the cells that are known; None where the mapper does not say."""
+    if grid.evidence is None:
+        return None
+    known = grid.evidence[grid.occupied | grid.free]
+    quartiles = np.percentile(known, (25, 50, 75)).tolist() if len(known) else [None, None, None]
+    return {"cells_known": len(known), "rays_per_cell_quartiles": quartiles}
 
 
 def check_writable(path: Path) -> None:
@@ -120,6 +130,8 @@ def table(result: ReplayResult) -> list[tuple[str, str]]:
         ("map", f"{result.options.mapper}, {frame.cols} x {frame.rows} cells of {frame.resolution:g} m"),
         ("bounds", f"x {x0:.2f} to {x1:.2f} m, y {y0:.2f} to {y1:.2f} m"),
     ]
+    if result.noise_std is not None:
+        rows.append(("range noise", f"{result.noise_std * 1000:.1f} mm (standard deviation)"))
     if result.pose_rmse is not None:
         metres, radians = result.pose_rmse
         rows.append(("pose error", f"{metres * 1000:.1f} mm, {np.degrees(radians):.2f} deg (RMS)"))

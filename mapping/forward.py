@@ -1,0 +1,326 @@
+"""The forward mapper: a sensor model fitted to all rays by expectation-maximisation (idea: Thrun 2003).
+
+Each cell has a chance to stop a ray that enters it. The map is the one, and the noise the one, that make the measured
+ranges most likely: cells are not asked one by one whether a range speaks for them, so that the map stays sharp where
+the noise is far larger than a cell. mapping.likelihood holds the model, mapping.sieve its prior, mapping.level one
+pass; this file says in which order, and mapping.calibration turns the fit into probabilities of occupancy.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+from collections.abc import Iterable
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mapping.calibration import occupancy
+from mapping.grid import GridFrame, Layer, OccupancyGrid
+from mapping.level import ALL, Choice, Level, Noise, Rays, Totals, evidence_of, smoothing_width
+from mapping.rays import end_extent
+from prim.frames import Pose2D, Scan
+from prim.world import Bounds
+
+START = 0.02
+"""The chance of every cell to stop a ray, before there is any measurement."""
+
+TOLERANCE = 5e-4
+"""A level has converged when a pass raises the mean log-likelihood of a ray by less than this."""
+
+COARSEST = 8
+"""The largest factor between the first level's cells and the map's."""
+
+PASSES = {1: 12, 2: 10, 4: 10, 8: 10}
+"""At most so many passes on the level whose cells are larger by a factor."""
+
+POWER = 3
+"""How often a pass multiplies the odds of a cell by their ratio: over-relaxation, taken back where it overshoots."""
+
+THIN_RAYS = 20_000
+THIN_STRIDE, HALF_STRIDE = 4, 2
+"""Of more rays, the coarsest level takes every fourth and the next ones every second, until the last passes."""
+
+LAST_PASSES = 3
+"""At most so many passes over all rays, at the end."""
+
+HELD_OUT_PASSES = 3
+HELD_OUT_RAYS = 1000
+"""The noise is found from rays that the map has not seen, unless there are fewer than this."""
+
+SIEVE_SPREAD = 3.5
+"""The sieve blurs the map, which takes about this many times its variance from the noise found (docs/forward.md)."""
+
+REVISITED = 512
+"""While streaming, this many older rays are looked at again with each scan."""
+
+STREAM_CELLS = 120_000
+"""While streaming, the map is kept at half the resolution, or coarser where it would have more cells."""
+
+
+@dataclass(frozen=True, slots=True)
+class Fit:
+    """What the forward model found, all arrays (rows, cols) float32.
+
+    ``stopping``: each cell's chance to stop a ray that enters it; ``arrival``: the mean chance, of the rays that come
+    to the cell, to come that far; ``evidence``: how many come there, expected hits and passes.
+    """
+
+    frame: GridFrame
+    stopping: NDArray[np.float32]
+    arrival: NDArray[np.float32]
+    evidence: NDArray[np.float32]
+    noise: Noise
+
+    def grid(self) -> OccupancyGrid:
+        """The calibrated probabilities of occupancy."""
+        spread = self.noise.std / self.frame.resolution
+        return OccupancyGrid(self.frame, occupancy(self.stopping, self.arrival, self.evidence, spread), self.evidence)
+
+
+class ForwardMapper:
+    """Fits the chance of every cell to stop a ray, and the sensor's noise, to all rays together.
+
+    ``noise_std`` (m) fixes the noise; else it is found from the rays, whatever ``start_std`` it begins with (by
+    default a guess from neighbouring beams). Bounds as in :class:`mapping.deterministic.DeterministicMapper`.
+    ``threads`` work side by side (by default one for each core) and give the same bits in any number.
+
+    While scans stream in, a coarser map is kept up to date with a bounded amount of work for each; ``grid()`` makes
+    the map of it in one pass over all rays, ``finish()`` fits from coarse to fine until TOLERANCE or PASSES.
+    """
+
+    name = "forward"
+
+    def __init__(
+        self,
+        resolution: float = 0.01,
+        bounds: Bounds | None = None,
+        noise_std: float | None = None,
+        start_std: float | None = None,
+        threads: int | None = None,
+    ) -> None:
+        self.resolution = resolution
+        self._layer = Layer(resolution, bounds, 0, np.uint8)
+        self._fixed = noise_std
+        self._start = start_std
+        self._rays = Rays()
+        workers = threads or len(os.sched_getaffinity(0))
+        self._pool = ThreadPoolExecutor(workers) if workers > 1 else None
+        self._stream: Stream | None = None
+        self._noise = Noise(noise_std or start_std or 10 * resolution)
+        self.history: list[tuple[int, Totals]] = []
+
+    @property
+    def noise_std(self) -> float:
+        """The noise (m) that was given, or found so far: the sieve's share is added to what the fit sees."""
+        if self._fixed is not None:
+            return self._fixed
+        width = smoothing_width(self._noise.std, self.resolution)
+        share = SIEVE_SPREAD * width**2 if width >= 0.3 * self.resolution else 0.0
+        return math.sqrt(self._noise.std**2 + share)
+
+    @property
+    def wild_share(self) -> float:
+        """The share of measurements that have nothing to do with the map."""
+        return self._noise.wild
+
+    def update(self, scan: Scan, pose: Pose2D) -> None:
+        """Adds one scan, taken by a laser at ``pose`` in the map frame."""
+        if not self.keep(scan, pose):
+            return
+        if self._stream is None:
+            self._noise = Noise(self._fixed or self._first_guess())
+        if self._stream is None or self._stream.level.frame != self._stream_frame():
+            self._stream = Stream(self._stream_frame(), self._stream)
+        self._noise = self._stream.take(self._rays, self._noise, self._fixed is not None)
+
+    def keep(self, scan: Scan, pose: Pose2D) -> bool:
+        """Keeps a scan for :meth:`finish` without looking at it now; whether it says anything."""
+        if not self._layer.fixed:
+            place = (pose.x, pose.y, math.cos(pose.theta), math.sin(pose.theta))
+            limits = (scan.range_min, scan.range_max)
+            self._layer.cover(*end_extent(scan.ranges, scan.directions, place, limits, 1 / self.resolution))
+        return self._rays.add(scan, pose) > 0
+
+    def grid(self) -> OccupancyGrid:
+        """The map so far."""
+        level = Level(self._frame(), START, self._pool)
+        if self._stream is not None:
+            level.smooth(self._noise.std)
+            level.start_from(self._stream.level)
+        return self._read(level, self._noise).grid()
+
+    def finish(self) -> OccupancyGrid:
+        """The map of all scans, fitted until nothing changes much."""
+        return self.fit().grid()
+
+    def fit(self) -> Fit:
+        """The fit itself, before it is turned into occupancy."""
+        level, self._noise = self._fit()
+        return self._read(level, self._noise)
+
+    def _frame(self) -> GridFrame:
+        return self._layer.used or self._layer.frame
+
+    def _stream_frame(self) -> GridFrame:
+        frame, factor = self._layer.frame, 2
+        while frame.rows * frame.cols > STREAM_CELLS * factor**2:
+            factor *= 2
+        return coarser(frame, factor)
+
+    def _first_guess(self) -> float:
+        """The noise to begin with: what neighbouring beams say, or more where so asked."""
+        return max(neighbour_noise(self._rays.rays[:, 2]) or 0.0, self._start or 0.0, self.resolution)
+
+    def _fit(self) -> tuple[Level, Noise]:
+        """From coarse to fine; then the noise from rays held out, and the map from all of them."""
+        self.history.clear()
+        learns = self._fixed is None
+        noise = Noise(self._fixed or self._first_guess())
+        holds_out = learns and len(self._rays) >= HELD_OUT_RAYS
+        many = len(self._rays) > THIN_RAYS
+        frame = self._frame()
+        level: Level | None = None
+        for factor in factors(noise.std / self.resolution):
+            finer = Level(coarser(frame, factor), START * factor, self._pool)
+            finer.smooth(noise.std)
+            if level is not None:
+                finer.start_from(level)
+                finer.keep_free(self._rays)
+            stride = (THIN_STRIDE if level is None else HALF_STRIDE) if many else 1
+            noise = self._climb(finer, factor, Choice(stride=stride, held_out=1 if holds_out else 0), noise, learns)
+            level = finer
+        assert level is not None
+        if holds_out:
+            noise = self._held_out_noise(level, noise)
+        if holds_out or many:
+            noise = self._climb(level, 1, ALL, noise, learns and not holds_out, LAST_PASSES)
+        level.free_all()
+        return level, noise
+
+    def _climb(
+        self, level: Level, factor: int, choice: Choice, noise: Noise, learns: bool, most: int | None = None
+    ) -> Noise:
+        """Passes over one level until it has converged; a step that overshot is taken back and over-relaxation ends."""
+        power, best = POWER, -math.inf
+        kept: tuple[NDArray[np.float32], NDArray[np.float32], Totals, Noise] | None = None
+        for _ in range(most or PASSES[factor]):
+            sums, totals = level.expect(self._rays, noise, choice)
+            if kept is not None and totals.per_ray < best and power > 1:
+                parameters, sums, totals, noise = kept
+                level.restore(parameters)
+                power = 1
+            elif totals.per_ray - best < TOLERANCE:
+                break
+            else:
+                self.history.append((factor, totals))
+            best = totals.per_ray
+            kept = level.parameters.copy(), sums, totals, noise
+            level.maximize(sums, power)
+            if learns:
+                noise = totals.noise(noise, level.frame.resolution)
+        return noise
+
+    def _held_out_noise(self, level: Level, noise: Noise) -> Noise:
+        """The noise that makes the rays most likely which the map has not seen."""
+        for _ in range(HELD_OUT_PASSES):
+            _, totals = level.expect(self._rays, noise, Choice(held_out=-1))
+            noise = totals.noise(noise, level.frame.resolution)
+        return noise
+
+    def _read(self, level: Level, noise: Noise) -> Fit:
+        """What all rays say about a level's map."""
+        sums, _ = level.expect(self._rays, noise, arrivals=True)
+        evidence, arrival = evidence_of(sums)
+        shape = level.frame.shape
+        return Fit(level.frame, level.stopping, arrival.reshape(shape), evidence.reshape(shape), noise)
+
+
+class Stream:
+    """The coarser map that is kept while scans come in: each is looked at together with some older rays."""
+
+    def __init__(self, frame: GridFrame, before: Stream | None) -> None:
+        self.level = Level(frame, START * 2)
+        self.level.blocks = 1
+        self._sums = np.zeros((1, self.level.parameters.size, 2), np.float32)
+        self._done = self._next = 0
+        if before is not None:
+            self.level.adopt(before.level)
+            self._done, self._next = before._done, before._next
+            self._place(before)
+
+    def _place(self, before: Stream) -> None:
+        """Takes over the sums of a smaller map."""
+        window = self.level.frame.window(before.level.frame)
+        rows, cols = self.level.frame.shape
+        self._sums.reshape(rows, cols, 2)[window] = before._sums.reshape(*before.level.frame.shape, 2)
+
+    def take(self, rays: Rays, noise: Noise, fixed: bool) -> Noise:
+        """Looks at the newest rays and at some old ones, makes one M step, and returns the noise so far.
+
+        Stepwise expectation-maximisation: the sums always stand for all rays, the newest look at each counting in
+        full and earlier looks fading.
+        """
+        new = Choice(begin=self._done, end=len(rays))
+        old = Choice(begin=self._next, end=min(self._next + REVISITED, self._done))
+        self.level.smooth(noise.std)
+        revisited = (old.end or 0) - old.begin
+        if self._done:
+            self._sums *= np.float32(1 - revisited / self._done)
+        found = []
+        for choice in (old, new):
+            if choice.end is not None and choice.end > choice.begin:
+                sums, totals = self.level.expect(rays, noise, choice)
+                self._sums += sums
+                found.append(totals)
+        self.level.maximize(self._sums)
+        self._next = old.end if old.end is not None and old.end < self._done else 0
+        self._done = len(rays)
+        if fixed or not found:
+            return noise
+        both = Totals(*(sum(values) for values in zip(*(_values(totals) for totals in found), strict=True)))
+        return _between(noise, both.noise(noise, self.level.frame.resolution))
+
+
+def _values(totals: Totals) -> tuple[float, int, float, float, float]:
+    return totals.log_likelihood, totals.rays, totals.stops, totals.squares, totals.wild
+
+
+def _between(old: Noise, new: Noise) -> Noise:
+    """The geometric mean of two steps' noise, so that one odd scan does not throw it."""
+    return Noise(math.sqrt(old.std * new.std), math.sqrt(old.wild * new.wild))
+
+
+def find_noise(scans: Iterable[tuple[Scan, Pose2D]], frame: GridFrame) -> float:
+    """The sensor's noise (m), found from scans and the poses of their laser, on a map of ``frame``."""
+    mapper = ForwardMapper(frame.resolution, frame.bounds)
+    for scan, pose in scans:
+        mapper.keep(scan, pose)
+    mapper.fit()
+    return mapper.noise_std
+
+
+def coarser(frame: GridFrame, factor: int) -> GridFrame:
+    """The frame of cells larger by ``factor``, on whole multiples of their size, that covers another."""
+    row, col = frame.row // factor, frame.col // factor
+    rows = -(-(frame.row + frame.rows) // factor) - row
+    cols = -(-(frame.col + frame.cols) // factor) - col
+    return GridFrame(frame.resolution * factor, row, col, rows, cols)
+
+
+def factors(spread: float) -> list[int]:
+    """The levels' factors for noise of ``spread`` cells, coarse to fine."""
+    factor = 4
+    while factor < COARSEST and 4 * factor < spread:
+        factor *= 2
+    return [factor >> k for k in range(factor.bit_length())]
+
+
+def neighbour_noise(ranges: NDArray[np.float32]) -> float | None:
+    """A guess at the noise (m) from the differences of neighbouring beams; None where there are no two."""
+    apart = np.diff(ranges[np.isfinite(ranges)])
+    if not len(apart):
+        return None
+    return float(np.median(np.abs(apart))) * 1.4826 / math.sqrt(2)
