@@ -18,8 +18,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapping.calibration import occupancy
-from mapping.grid import GridFrame, Layer, OccupancyGrid
-from mapping.level import ALL, Choice, Level, Noise, Rays, Totals, evidence_of, smoothing_width
+from mapping.grid import UNKNOWN, GridFrame, Layer, OccupancyGrid
+from mapping.level import ALL, COLUMNS, Choice, Level, Noise, Rays, Totals, cells_within, evidence_of, smoothing_width
 from mapping.rays import end_extent
 from prim.frames import Pose2D, Scan
 from prim.world import Bounds
@@ -27,8 +27,8 @@ from prim.world import Bounds
 START = 0.02
 """The chance of every cell to stop a ray, before there is any measurement."""
 
-TOLERANCE = 5e-4
-"""A level has converged when a pass raises the mean log-likelihood of a ray by less than this."""
+TOLERANCE, COARSE_TOLERANCE = 5e-4, 2e-3
+"""A level has converged when a pass raises the mean log-likelihood of a ray by less: the last one, and the others."""
 
 COARSEST = 8
 """The largest factor between the first level's cells and the map's."""
@@ -53,7 +53,7 @@ HELD_OUT_RAYS = 1000
 SIEVE_SPREAD = 3.5
 """The sieve blurs the map, which takes about this many times its variance from the noise found (docs/forward.md)."""
 
-REVISITED = 512
+REVISITED = 256
 """While streaming, this many older rays are looked at again with each scan."""
 
 STREAM_CELLS = 120_000
@@ -87,8 +87,8 @@ class ForwardMapper:
     default a guess from neighbouring beams). Bounds as in :class:`mapping.deterministic.DeterministicMapper`.
     ``threads`` work side by side (by default one for each core) and give the same bits in any number.
 
-    While scans stream in, a coarser map is kept up to date with a bounded amount of work for each; ``grid()`` makes
-    the map of it in one pass over all rays, ``finish()`` fits from coarse to fine until TOLERANCE or PASSES.
+    While scans stream in, a coarser map is kept up to date with a bounded amount of work for each; ``grid()`` is
+    made of it, ``finish()`` fits from coarse to fine until TOLERANCE or PASSES.
     """
 
     name = "forward"
@@ -145,12 +145,16 @@ class ForwardMapper:
         return self._rays.add(scan, pose) > 0
 
     def grid(self) -> OccupancyGrid:
-        """The map so far."""
-        level = Level(self._frame(), START, self._pool)
-        if self._stream is not None:
-            level.smooth(self._noise.std)
-            level.start_from(self._stream.level)
-        return self._read(level, self._noise).grid()
+        """The map so far, from the coarser one that is kept while scans come in."""
+        frame = self._frame()
+        if self._stream is None:
+            unknown = np.full(frame.shape, UNKNOWN, np.float32)
+            return OccupancyGrid(frame, unknown, np.zeros_like(unknown))
+        coarse = self._stream.fit(self._noise).grid()
+        cells = cells_within(coarse.frame, frame)
+        ratio = coarse.frame.resolution / frame.resolution
+        assert coarse.evidence is not None
+        return OccupancyGrid(frame, coarse.probability[cells], coarse.evidence[cells] / np.float32(ratio))
 
     def finish(self) -> OccupancyGrid:
         """The map of all scans, fitted until nothing changes much."""
@@ -203,7 +207,7 @@ class ForwardMapper:
     def _climb(
         self, level: Level, factor: int, choice: Choice, noise: Noise, learns: bool, most: int | None = None
     ) -> Noise:
-        """Passes over one level until it has converged; a step that overshot is taken back and over-relaxation ends."""
+        """Passes over one level until it has converged; a step that overshot is taken back, and made plain."""
         power, best = POWER, -math.inf
         kept: tuple[NDArray[np.float32], NDArray[np.float32], Totals, Noise] | None = None
         for _ in range(most or PASSES[factor]):
@@ -212,7 +216,7 @@ class ForwardMapper:
                 parameters, sums, totals, noise = kept
                 level.restore(parameters)
                 power = 1
-            elif totals.per_ray - best < TOLERANCE:
+            elif totals.per_ray - best < (TOLERANCE if factor == 1 else COARSE_TOLERANCE):
                 break
             else:
                 self.history.append((factor, totals))
@@ -233,9 +237,14 @@ class ForwardMapper:
     def _read(self, level: Level, noise: Noise) -> Fit:
         """What all rays say about a level's map."""
         sums, _ = level.expect(self._rays, noise, arrivals=True)
-        evidence, arrival = evidence_of(sums)
-        shape = level.frame.shape
-        return Fit(level.frame, level.stopping, arrival.reshape(shape), evidence.reshape(shape), noise)
+        return read(level, sums, noise)
+
+
+def read(level: Level, sums: NDArray[np.float32], noise: Noise) -> Fit:
+    """A level's map with what an E step says about it."""
+    evidence, arrival = evidence_of(sums)
+    shape = level.frame.shape
+    return Fit(level.frame, level.stopping, arrival.reshape(shape), evidence.reshape(shape), noise)
 
 
 class Stream:
@@ -244,7 +253,7 @@ class Stream:
     def __init__(self, frame: GridFrame, before: Stream | None) -> None:
         self.level = Level(frame, START * 2)
         self.level.blocks = 1
-        self._sums = np.zeros((1, self.level.parameters.size, 2), np.float32)
+        self._sums = np.zeros((1, self.level.parameters.size, COLUMNS), np.float32)
         self._done = self._next = 0
         if before is not None:
             self.level.adopt(before.level)
@@ -255,7 +264,11 @@ class Stream:
         """Takes over the sums of a smaller map."""
         window = self.level.frame.window(before.level.frame)
         rows, cols = self.level.frame.shape
-        self._sums.reshape(rows, cols, 2)[window] = before._sums.reshape(*before.level.frame.shape, 2)
+        self._sums.reshape(rows, cols, COLUMNS)[window] = before._sums.reshape(*before.level.frame.shape, COLUMNS)
+
+    def fit(self, noise: Noise) -> Fit:
+        """The map so far, at this level's resolution."""
+        return read(self.level, self._sums, noise)
 
     def take(self, rays: Rays, noise: Noise, fixed: bool) -> Noise:
         """Looks at the newest rays and at some old ones, makes one M step, and returns the noise so far.
@@ -272,7 +285,7 @@ class Stream:
         found = []
         for choice in (old, new):
             if choice.end is not None and choice.end > choice.begin:
-                sums, totals = self.level.expect(rays, noise, choice)
+                sums, totals = self.level.expect(rays, noise, choice, arrivals=True)
                 self._sums += sums
                 found.append(totals)
         self.level.maximize(self._sums)

@@ -6,6 +6,7 @@ import math
 from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,9 +30,9 @@ from prim.frames import Pose2D, Scan
 from prim.metrics import dilate
 from prim.raycast import FloatArray
 
-BLOCKS = 8
-BLOCK_CELLS = 40_000_000
-"""Sums are kept for this many blocks of rays, or for fewer where that would be more cells in all.
+LEAST_BLOCKS, MOST_BLOCKS = 2, 8
+BLOCK_CELLS = 4_000_000
+"""Sums are kept for so many blocks of rays, for the fewer the larger the grid: about this many cells in all.
 
 The number of blocks depends on the grid alone, and they are added up in order: any number of threads gives the same
 bits.
@@ -49,10 +50,14 @@ LEAST_WILD, MOST_WILD = 1e-4, 0.3
 LEAST_NOISE = 0.15
 """The noise is never taken as smaller than this many cells."""
 
+COLUMNS = 3
+"""Sums are kept of hits, passes and, where they are asked for, arrivals."""
+
 FARTHEST = 1000.0
 """A sensor without a range_max is taken to see this far (m)."""
 
 _TABLE = tables()
+_NO_LEADS = np.zeros(0, np.int32)
 
 
 @dataclass(frozen=True, slots=True)
@@ -95,11 +100,12 @@ class Rays:
 
     def __init__(self) -> None:
         self._rays = np.empty((0, 3), np.float32)
-        self._scans: list[tuple[float, float, float, float]] = []
-        self._first = [0]
+        self._scans = np.empty((0, 4), np.float64)
+        self._first = np.zeros(1, np.int64)
+        self._count = 0
 
     def __len__(self) -> int:
-        return self._first[-1]
+        return int(self._first[self._count])
 
     @property
     def rays(self) -> NDArray[np.float32]:
@@ -109,12 +115,12 @@ class Rays:
     @property
     def scans(self) -> FloatArray:
         """Sensor's x, y, range_min, range_max of every scan."""
-        return np.array(self._scans, dtype=np.float64).reshape(-1, 4)
+        return self._scans[: self._count]
 
     @property
     def first(self) -> NDArray[np.int64]:
         """Where each scan's rays begin, and where the last one's end."""
-        return np.array(self._first, dtype=np.int64)
+        return self._first[: self._count + 1]
 
     def add(self, scan: Scan, pose: Pose2D) -> int:
         """Adds a scan's measurements; returns how many.
@@ -129,15 +135,24 @@ class Rays:
         directions = scan.directions[used] @ np.array([[cos, sin], [-sin, cos]])
         count = len(directions)
         begin, end = len(self), len(self) + count
-        if end > len(self._rays):
-            grown = np.empty((max(2 * len(self._rays), end), 3), np.float32)
-            grown[:begin] = self.rays
-            self._rays = grown
+        self._rays = _grown(self._rays, end)
+        self._scans = _grown(self._scans, self._count + 1)
+        self._first = _grown(self._first, self._count + 2)
         self._rays[begin:end, :2] = directions
         self._rays[begin:end, 2] = np.where(z[used] >= scan.range_max, np.inf, z[used])
-        self._scans.append((pose.x, pose.y, max(scan.range_min, 0.0), min(scan.range_max, FARTHEST)))
-        self._first.append(end)
+        self._scans[self._count] = pose.x, pose.y, max(scan.range_min, 0.0), min(scan.range_max, FARTHEST)
+        self._count += 1
+        self._first[self._count] = end
         return count
+
+
+def _grown(array: NDArray[Any], length: int) -> NDArray[Any]:
+    """The array, or a copy with room for twice as many rows where it has fewer than ``length``."""
+    if len(array) >= length:
+        return array
+    grown = np.empty((max(2 * len(array), length), *array.shape[1:]), array.dtype)
+    grown[: len(array)] = array
+    return grown
 
 
 @dataclass(frozen=True, slots=True)
@@ -171,7 +186,7 @@ class Level:
         self._active = np.ones(frame.shape, np.bool_)
         self._leads: NDArray[np.int32] | None = None
         self._hits, self._passes, self._blurred, self._between = (np.empty(frame.shape, np.float32) for _ in range(4))
-        self.blocks = max(1, min(BLOCKS, BLOCK_CELLS // (frame.rows * frame.cols)))
+        self.blocks = max(LEAST_BLOCKS, min(MOST_BLOCKS, BLOCK_CELLS // (frame.rows * frame.cols)))
         self.smooth(0.0)
 
     @property
@@ -188,9 +203,7 @@ class Level:
     def start_from(self, coarser: Level) -> None:
         """Takes over a coarser level's map: a ray that crosses one of its cells crosses several here."""
         ratio = round(coarser.frame.resolution / self.frame.resolution)
-        rows = (np.arange(self.frame.rows) + self.frame.row) // ratio - coarser.frame.row
-        cols = (np.arange(self.frame.cols) + self.frame.col) // ratio - coarser.frame.col
-        finer = coarser.parameters[np.ix_(rows, cols)]
+        finer = coarser.parameters[cells_within(coarser.frame, self.frame)]
         self.parameters = np.clip(1 - (1 - finer) ** np.float32(1 / ratio), LEAST, MOST).astype(np.float32)
         self._spread()
 
@@ -229,11 +242,10 @@ class Level:
     def expect(
         self, rays: Rays, noise: Noise, choice: Choice = ALL, arrivals: bool = False
     ) -> tuple[NDArray[np.float32], Totals]:
-        """The E step: ``sums`` (blocks, rows * cols, 2 or 3), as :func:`mapping.likelihood.expect` fills them."""
-        columns = 3 if arrivals else 2
-        sums = np.zeros((self.blocks, self.parameters.size, columns), np.float32)
+        """The E step: ``sums`` (blocks, rows * cols, 3 or 2), as :func:`mapping.likelihood.expect` fills them."""
+        sums = np.zeros((self.blocks, self.parameters.size, COLUMNS if arrivals else COLUMNS - 1), np.float32)
         totals = np.zeros((self.blocks, 6))
-        leads = self._leads if self._leads is not None else np.zeros(len(rays), np.int32)
+        leads = self._leads if self._leads is not None else _NO_LEADS
         scans, first, resolution = rays.scans, rays.first, self.frame.resolution
 
         def run(block: int, begin: int, end: int) -> None:
@@ -287,6 +299,14 @@ class Level:
                 run(*span)
         else:
             list(self._pool.map(lambda span: run(*span), spans))
+
+
+def cells_within(coarse: GridFrame, fine: GridFrame) -> tuple[NDArray[np.signedinteger[Any]], ...]:
+    """The index into a coarse frame's arrays that gives each of a finer frame's cells the cell it lies in."""
+    ratio = round(coarse.resolution / fine.resolution)
+    rows = (np.arange(fine.rows) + fine.row) // ratio - coarse.row
+    cols = (np.arange(fine.cols) + fine.col) // ratio - coarse.col
+    return np.ix_(rows, cols)
 
 
 def smoothing_width(std: float, resolution: float) -> float:

@@ -302,10 +302,10 @@ def expect(
     ``scans`` (S, 4) float64: sensor's x, y, range_min, range_max (m); ``first_rays`` (S + 1,): where each scan's rays
     begin in ``rays`` (N, 3) float32: direction in the plane, and range (m; -inf: nearer than range_min, inf: no
     return). The grid ``stopping`` (rows, cols) float32, the chance of each cell to stop a ray, begins at ``corner``
-    (x, y in metres) with cells of ``resolution`` metres. ``leads`` (N,) int32 says how
-    many of a ray's first cells may be passed over, since they stop nothing and gather nothing. ``sigma`` (m) and
-    ``epsilon`` are the noise and the share of wild measurements; ``table`` is made by :func:`tables`. A ``held_out``
-    of 1 leaves out every HOLD_OUT-th ray, -1 takes only those, 0 takes all.
+    (x, y in metres) with cells of ``resolution`` metres. ``leads`` (N,) int32, where not empty, says how many of a
+    ray's first cells may be passed over: they stop and gather nothing. ``sigma`` (m) and ``epsilon`` are the noise
+    and the share of wild measurements; ``table`` is made by :func:`tables`. A ``held_out`` of 1 leaves out every
+    HOLD_OUT-th ray, -1 takes only those, 0 takes all.
 
     ``sums`` (rows * cols, 2 or 3) float32 gets the expected HITS and PASSES and, where it has a third column, the
     sum over rays that come to the cell of their chance to come that far (ARRIVALS). ``totals`` (6,) float64 gets
@@ -343,7 +343,7 @@ def expect(
         exit_at = s0 + (last + 0.5) * ds
         leaves = exit_at <= furthest
         stop = last if leaves else min(last, int((furthest - s0) / ds))
-        line = (first + leads[i], start, major, minor, offset, tilt)
+        line = (first + (leads[i] if len(leads) else 0), start, major, minor, offset, tilt)
         x_start, x_step = np.float32((s0 - z) * inverse_spread), np.float32(ds * inverse_spread)
         count, left = walk(line, stop, x_start, x_step, flat, where, chance, apart)
         gone = 0.0

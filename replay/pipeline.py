@@ -180,7 +180,14 @@ class Pipeline:
             frame = self._frame(scans, poses, truth)
             mapper = self._mapper(scans, poses, frame)
             judge = Judge(frame, truth, poses, true_poses)
-            scene = Scene(log.path.name, self.options.mapper, frame.bounds, judge.scores_maps, judge.compares_poses)
+            scene = Scene(
+                log.path.name,
+                self.options.mapper,
+                frame.bounds,
+                judge.scores_maps,
+                judge.compares_poses,
+                has_evidence=self.options.mapper == "forward",
+            )
             self._begin(log, scans, poses, scene)
             used = self._map_scans(scans, poses, mapper, judge, truth, self._map_every(len(scans), frame))
             with self._clock.stage("map"):
@@ -336,7 +343,8 @@ class Pipeline:
                 if error is not None:
                     self.viewer.show_pose_error(position, stamp, *error)
             if map_every and position % map_every == 0:
-                grid = mapper.grid()
+                with self._clock.stage("map"):
+                    grid = mapper.grid()
                 scores = judge.score(grid)
                 with self._clock.stage("viewer"):
                     self.viewer.show_map(position, stamp, grid, scores)

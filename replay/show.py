@@ -45,7 +45,8 @@ class ViewerOptions:
 class Scene:
     """What is known before the first scan.
 
-    The log's name, the mapper, the map's bounds (m), and whether the map and the poses are held against the truth.
+    The log's name, the mapper, the map's bounds (m), whether the map and the poses are held against the truth, and
+    whether the mapper says how much evidence each cell has.
     """
 
     log: str
@@ -53,6 +54,7 @@ class Scene:
     bounds: Bounds
     has_scores: bool
     has_pose_errors: bool
+    has_evidence: bool = False
 
 
 class Viewer(Protocol):

@@ -15,6 +15,7 @@ from urllib.parse import quote, urlsplit
 import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
+from numpy.typing import NDArray
 
 from mapping.grid import OccupancyGrid
 from prim.errors import OutputError, PrimError, UsageError
@@ -100,6 +101,7 @@ class RerunViewer:
         self._recording.send_recording_name(f"{scene.log} ({scene.mapper})")
         self._recording.send_blueprint(_blueprint(scene))
         self._static("map", rr.ViewCoordinates.RIGHT_HAND_Z_UP)
+        self._static("evidence", rr.ViewCoordinates.RIGHT_HAND_Z_UP)
         self._name_series("scores", SCORES.values())
         self._name_series("pose_error/position", [("position, mm", (86, 180, 233))])
         self._name_series("pose_error/heading", [("heading, degrees", (230, 159, 0))])
@@ -137,6 +139,8 @@ class RerunViewer:
         self._send_batch()
         self._at(position, stamp)
         self._recording.log("map/grid", _grid_map(grid))
+        if grid.evidence is not None:
+            self._recording.log("evidence/grid", _evidence_map(grid))
         if scores is not None:
             values = [value if (value := getattr(scores, name)) is not None else math.nan for name in SCORES]
             self._recording.log("scores", rr.Scalars(values))
@@ -277,13 +281,19 @@ def _blueprint(scene: Scene) -> rrb.Blueprint:
         look_target=(centre_x, centre_y, 0.0),
         eye_up=(0.0, 1.0, 0.0),
     )
-    map_view = rrb.Spatial3DView(
-        origin="map",
-        name=f"Map ({scene.mapper}), from above",
-        eye_controls=top_down,
-        line_grid=rrb.LineGrid3D(visible=False),
-        background=(235, 235, 235, 255),
-    )
+
+    def from_above(origin: str, name: str) -> rrb.Spatial3DView:
+        return rrb.Spatial3DView(
+            origin=origin,
+            name=name,
+            eye_controls=top_down,
+            line_grid=rrb.LineGrid3D(visible=False),
+            background=(235, 235, 235, 255),
+        )
+
+    left: Any = from_above("map", f"Map ({scene.mapper}), from above")
+    if scene.has_evidence:
+        left = rrb.Tabs(left, from_above("evidence", "Evidence: rays per cell"), active_tab=0)
     right: list[Any] = [rrb.TextDocumentView(origin="summary", name="Result")]
     if scene.has_scores:
         unit = rrb.ScalarAxis(range=(0.0, 1.02), zoom_lock=True)
@@ -293,7 +303,7 @@ def _blueprint(scene: Scene) -> rrb.Blueprint:
     right += [_series("timing", "Stage timings"), rrb.TextLogView(origin="events", name="Events")]
     shares = [2.0, *[2.0] * (len(right) - 2), 1.2]
     return rrb.Blueprint(
-        rrb.Horizontal(map_view, rrb.Vertical(*right, row_shares=shares), column_shares=[3, 2]),
+        rrb.Horizontal(left, rrb.Vertical(*right, row_shares=shares), column_shares=[3, 2]),
         rrb.TimePanel(timeline=STAMP, state="collapsed"),
         rrb.BlueprintPanel(state="collapsed"),
         rrb.SelectionPanel(state="collapsed"),
@@ -309,17 +319,28 @@ def _grid_map(grid: OccupancyGrid) -> rr.GridMap:
     """A grid as nav_msgs values (0 free to 100 occupied, 255 unknown), flipped: rerun's first row is the top."""
     percent = np.rint(grid.probability * 100).astype(np.uint8)
     percent[grid.probability == 0.5] = 255
+    return _as_grid_map(grid, percent, rr.components.Colormap.RvizMap)
+
+
+def _as_grid_map(grid: OccupancyGrid, values: NDArray[np.uint8], colormap: Any) -> rr.GridMap:
     rows, cols = grid.frame.shape
     x, y = grid.frame.origin
     return rr.GridMap(
-        data=np.flipud(percent).tobytes(),
+        data=np.flipud(values).tobytes(),
         format=rr.components.ImageFormat(
             width=cols, height=rows, color_model=rr.ColorModel.L, channel_datatype=rr.ChannelDatatype.U8
         ),
         cell_size=grid.frame.resolution,
         translation=(x, y, 0.0),
-        colormap=rr.components.Colormap.RvizMap,
+        colormap=colormap,
     )
+
+
+def _evidence_map(grid: OccupancyGrid) -> rr.GridMap:
+    """How many rays came to each cell, as grey on a logarithmic scale: black none, white 10,000 and more."""
+    assert grid.evidence is not None
+    grey = np.clip(np.log10(1 + grid.evidence) * (255 / 4), 0, 255).astype(np.uint8)
+    return _as_grid_map(grid, grey, None)
 
 
 def _index(times: Sequence[tuple[int, int]]) -> list[Any]:
