@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from bench.maps import NOISE_LEVELS, update
 from bench.sessions import recorded
-from mapping.calibration import CLIP, LEAST_EVIDENCE, behind_surface
+from mapping.calibration import CLIP, behind_surface, known
 from mapping.forward import ForwardMapper
 from recorder.sensors import Lidar
 from recorder.session import SessionOptions
@@ -55,8 +55,8 @@ def features(job: Job) -> tuple[Job, NDArray[np.float64], NDArray[np.bool_], NDA
     for scan, pose in session.scans:
         mapper.keep(scan, pose)
     fit = mapper.fit()
-    used = (session.truth.occupied | session.truth.free) & (fit.evidence >= LEAST_EVIDENCE)
-    own, near = (log_odds(array[used]) for array in behind_surface(fit.stopping, fit.arrival, fit.evidence))
+    used = (session.truth.occupied | session.truth.free) & known(fit.certainty, fit.evidence)
+    own, near = (log_odds(array[used]) for array in behind_surface(fit.stopping, fit.certainty, fit.evidence))
     stopping = np.log(fit.stopping[used].astype(np.float64))
     log_noise = math.log(fit.noise.std / resolution)
     columns = np.column_stack([v * log_noise**k for v in (np.ones_like(own), own, near, stopping) for k in range(3)])

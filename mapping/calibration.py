@@ -1,9 +1,9 @@
 """From the forward model's fit to a calibrated probability of occupancy.
 
 A cell's chance to stop a ray is no occupancy: where the noise is large, a surface is spread over several cells, each
-of which stops few of the rays that come to it. What tells the inside from the outside is how far rays come: with R
-the mean chance of the rays that come to a cell to come that far, 1 - (1 - o) R is the chance that a surface lies
-before the cell's far side. Its log-odds, those of its neighbourhood, o itself and the noise go into a logistic
+of which stops few of the rays that come to it. What tells the inside from the outside is how surely rays come there:
+with R the certainty of the rays that are expected to have come to a cell, 1 - (1 - o) R is the chance that a surface
+lies before the cell's far side. Its log-odds, those of its neighbourhood, o itself and the noise go into a logistic
 regression whose coefficients were found on recorded sessions (bench/calibrate.py).
 """
 
@@ -19,7 +19,7 @@ from mapping.rays import kernel
 from mapping.sieve import blur, taps
 
 LEAST_EVIDENCE = 0.5
-"""Below this many expected hits and passes a cell counts as unknown."""
+"""A cell is unknown where fewer rays than this came, each weighed by how certain that is."""
 
 FULL_EVIDENCE = 5.0
 """In a neighbourhood, cells with more evidence than this count the same."""
@@ -29,20 +29,20 @@ CLIP = 1e-6
 
 COEFFICIENTS = np.array(
     [
-        [12.748, -5.180, 0.610],
-        [-1.209, -0.404, 0.050],
-        [12.100, -4.651, 0.596],
-        [0.286, 0.265, -0.025],
+        [13.200, -5.243, 0.584],
+        [-0.518, -0.506, 0.008],
+        [10.070, -3.371, 0.436],
+        [0.129, 0.134, 0.010],
     ]
 )
 """Rows: 1, the cell's log-odds, its neighbourhood's, ln(o). Columns: times 1, L, L^2; L = ln(noise / resolution)."""
 
 
 def behind_surface(
-    stopping: NDArray[np.float32], arrival: NDArray[np.float32], evidence: NDArray[np.float32]
+    stopping: NDArray[np.float32], certainty: NDArray[np.float32], evidence: NDArray[np.float32]
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """The chance (rows, cols) that a surface lies before a cell's far side, and its mean over the neighbourhood."""
-    chance = np.asarray(1 - (1 - stopping) * arrival, dtype=np.float32)
+    chance = np.asarray(1 - (1 - stopping) * certainty, dtype=np.float32)
     weight = np.minimum(evidence, np.float32(FULL_EVIDENCE))
     between, above, below = (np.empty_like(chance) for _ in range(3))
     gaussian = taps(1.0)
@@ -52,30 +52,35 @@ def behind_surface(
     return chance, np.asarray(around, dtype=np.float32)
 
 
+def known(certainty: NDArray[np.float32], evidence: NDArray[np.float32]) -> NDArray[np.bool_]:
+    """Which cells (rows, cols) are known at all."""
+    return np.asarray(certainty * evidence >= LEAST_EVIDENCE)
+
+
 def occupancy(
     stopping: NDArray[np.float32],
-    arrival: NDArray[np.float32],
+    certainty: NDArray[np.float32],
     evidence: NDArray[np.float32],
     noise_cells: float,
 ) -> NDArray[np.float32]:
     """Probabilities of occupancy (rows, cols) float32; 0.5 where there is too little evidence.
 
-    ``stopping`` are the cells' chances to stop a ray, ``arrival`` the mean chance of their rays to come that far,
-    ``evidence`` expected hits and passes, ``noise_cells`` the noise's standard deviation in cells.
+    ``stopping``, ``certainty`` and ``evidence`` are as in :class:`mapping.forward.Fit`, ``noise_cells`` is the
+    noise's standard deviation in cells.
     """
-    chance, around = behind_surface(stopping, arrival, evidence)
+    chance, around = behind_surface(stopping, certainty, evidence)
     probability = np.empty_like(stopping)
     log_noise = math.log(noise_cells)
     weights = COEFFICIENTS @ (1.0, log_noise, log_noise**2)
-    _logistic(chance, around, stopping, evidence, weights, probability)
+    _logistic(chance, around, stopping, certainty * evidence, weights, probability)
     return probability
 
 
 @kernel
-def _logistic(chance: Any, around: Any, stopping: Any, evidence: Any, weights: Any, probability: Any) -> None:
+def _logistic(chance: Any, around: Any, stopping: Any, certain: Any, weights: Any, probability: Any) -> None:
     for i in range(chance.shape[0]):
         for j in range(chance.shape[1]):
-            if evidence[i, j] < LEAST_EVIDENCE:
+            if certain[i, j] < LEAST_EVIDENCE:
                 probability[i, j] = 0.5
                 continue
             p, q = min(max(chance[i, j], CLIP), 1 - CLIP), min(max(around[i, j], CLIP), 1 - CLIP)

@@ -64,20 +64,22 @@ STREAM_CELLS = 120_000
 class Fit:
     """What the forward model found, all arrays (rows, cols) float32.
 
-    ``stopping``: each cell's chance to stop a ray that enters it; ``arrival``: the mean chance, of the rays that come
-    to the cell, to come that far; ``evidence``: how many come there, expected hits and passes.
+    ``stopping``: each cell's chance to stop a ray that enters it; ``evidence``: how many rays came to it, expected
+    hits and passes; ``certainty``: the mean over those of the chance that they came.
     """
 
     frame: GridFrame
     stopping: NDArray[np.float32]
-    arrival: NDArray[np.float32]
     evidence: NDArray[np.float32]
+    certainty: NDArray[np.float32]
     noise: Noise
 
     def grid(self) -> OccupancyGrid:
         """The calibrated probabilities of occupancy."""
         spread = self.noise.std / self.frame.resolution
-        return OccupancyGrid(self.frame, occupancy(self.stopping, self.arrival, self.evidence, spread), self.evidence)
+        return OccupancyGrid(
+            self.frame, occupancy(self.stopping, self.certainty, self.evidence, spread), self.evidence
+        )
 
 
 class ForwardMapper:
@@ -236,15 +238,15 @@ class ForwardMapper:
 
     def _read(self, level: Level, noise: Noise) -> Fit:
         """What all rays say about a level's map."""
-        sums, _ = level.expect(self._rays, noise, arrivals=True)
+        sums, _ = level.expect(self._rays, noise, certain=True)
         return read(level, sums, noise)
 
 
 def read(level: Level, sums: NDArray[np.float32], noise: Noise) -> Fit:
     """A level's map with what an E step says about it."""
-    evidence, arrival = evidence_of(sums)
+    evidence, certainty = evidence_of(sums)
     shape = level.frame.shape
-    return Fit(level.frame, level.stopping, arrival.reshape(shape), evidence.reshape(shape), noise)
+    return Fit(level.frame, level.stopping, evidence.reshape(shape), certainty.reshape(shape), noise)
 
 
 class Stream:
@@ -285,7 +287,7 @@ class Stream:
         found = []
         for choice in (old, new):
             if choice.end is not None and choice.end > choice.begin:
-                sums, totals = self.level.expect(rays, noise, choice, arrivals=True)
+                sums, totals = self.level.expect(rays, noise, choice, certain=True)
                 self._sums += sums
                 found.append(totals)
         self.level.maximize(self._sums)

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from mapping.grid import GridFrame
 from mapping.likelihood import (
-    ARRIVALS,
+    CERTAIN,
     HITS,
     LOG_LIKELIHOOD,
     PASSES,
@@ -51,7 +51,7 @@ LEAST_NOISE = 0.15
 """The noise is never taken as smaller than this many cells."""
 
 COLUMNS = 3
-"""Sums are kept of hits, passes and, where they are asked for, arrivals."""
+"""Sums are kept of hits, of passes and, where it is asked for, of how certain those are."""
 
 FARTHEST = 1000.0
 """A sensor without a range_max is taken to see this far (m)."""
@@ -240,10 +240,10 @@ class Level:
         self._leads = None
 
     def expect(
-        self, rays: Rays, noise: Noise, choice: Choice = ALL, arrivals: bool = False
+        self, rays: Rays, noise: Noise, choice: Choice = ALL, certain: bool = False
     ) -> tuple[NDArray[np.float32], Totals]:
         """The E step: ``sums`` (blocks, rows * cols, 3 or 2), as :func:`mapping.likelihood.expect` fills them."""
-        sums = np.zeros((self.blocks, self.parameters.size, COLUMNS if arrivals else COLUMNS - 1), np.float32)
+        sums = np.zeros((self.blocks, self.parameters.size, COLUMNS if certain else COLUMNS - 1), np.float32)
         totals = np.zeros((self.blocks, 6))
         leads = self._leads if self._leads is not None else _NO_LEADS
         scans, first, resolution = rays.scans, rays.first, self.frame.resolution
@@ -315,7 +315,7 @@ def smoothing_width(std: float, resolution: float) -> float:
 
 
 def evidence_of(sums: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Each cell's evidence (expected hits and passes), and the share of chance that such rays had to come there."""
+    """Each cell's evidence (expected hits and passes), and the mean chance of those rays to have come there."""
     added = sums.sum(axis=0)
     evidence = added[:, HITS] + added[:, PASSES]
-    return evidence, added[:, ARRIVALS] / np.maximum(evidence, np.float32(1e-9))
+    return evidence, added[:, CERTAIN] / np.maximum(evidence, np.float32(1e-9))

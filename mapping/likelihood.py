@@ -54,7 +54,7 @@ WILD_TAIL = 0.1
 """The share of wild measurements that read as too near, and as no return; the rest is spread over all ranges."""
 
 MEASURED, TOO_NEAR, NO_RETURN = 0, 1, 2
-HITS, PASSES, ARRIVALS = 0, 1, 2
+HITS, PASSES, CERTAIN = 0, 1, 2
 LOG_LIKELIHOOD, STOPS, SQUARES, WILD, RAYS, VISITS = range(6)
 
 ROOT_HALF = math.sqrt(0.5)
@@ -265,7 +265,7 @@ def moments_cut(row: int, count: int, factor: Any, share: Any, apart: Any, table
 
 
 @kernel
-def scatter(count: int, behind: Any, share: Any, where: Any, chance: Any, sums: Any, arrivals: bool) -> None:
+def scatter(count: int, behind: Any, share: Any, where: Any, sums: Any, certain: bool) -> None:
     """Adds a ray's responsibilities to its cells, from the last one back; ``behind`` is what lies beyond them."""
     for i in range(count - 1, -1, -1):
         n = np.uintp(i)
@@ -274,8 +274,8 @@ def scatter(count: int, behind: Any, share: Any, where: Any, chance: Any, sums: 
         sums[c, HITS] += q
         sums[c, PASSES] += behind
         behind += q
-        if arrivals:
-            sums[c, ARRIVALS] += behind * chance[n]
+        if certain:
+            sums[c, CERTAIN] += behind * behind
 
 
 @kernel
@@ -308,12 +308,12 @@ def expect(
     HOLD_OUT-th ray, -1 takes only those, 0 takes all.
 
     ``sums`` (rows * cols, 2 or 3) float32 gets the expected HITS and PASSES and, where it has a third column, the
-    sum over rays that come to the cell of their chance to come that far (ARRIVALS). ``totals`` (6,) float64 gets
+    sum of squares of the rays' chances to have come to the cell (CERTAIN). ``totals`` (6,) float64 gets
     LOG_LIKELIHOOD, the expected STOPS, their SQUARES ((z - s)^2 in sigma^2), expected WILD, RAYS and VISITS.
     """
     rows, cols = stopping.shape
     flat = stopping.reshape(-1)
-    arrivals = sums.shape[1] > 2
+    certain = sums.shape[1] > 2
     longest = rows + cols + CHUNK
     where, share = np.empty(longest, np.int64), np.empty(longest, np.float32)
     apart, chance = np.empty(longest, np.float32), np.empty(longest, np.float32)
@@ -365,7 +365,7 @@ def expect(
             stops, squares = moments(count, factor, share, apart)
         else:
             stops, squares = moments_cut(2 + kind, count, factor, share, apart, table)
-        scatter(count, np.float32(gone * weight), share, where, chance, sums, arrivals)
+        scatter(count, np.float32(gone * weight), share, where, sums, certain)
         totals[LOG_LIKELIHOOD] += math.log(density * per_metre if kind == MEASURED else density)
         totals[STOPS] += stops
         totals[SQUARES] += squares
