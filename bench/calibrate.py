@@ -45,7 +45,11 @@ def jobs(first_seed: int, sessions: int) -> Iterator[Job]:
 
 
 def features(job: Job) -> tuple[Job, NDArray[np.float64], NDArray[np.bool_], NDArray[np.float32]]:
-    """Of every cell that is truly occupied or truly free and has evidence: features, truth, probability."""
+    """Of every cell that is truly occupied or truly free and known: features, truth, probability.
+
+    The cells beside a surface count as free where the noise is smaller than a cell; where it is larger they cannot be
+    told from the surface, and count as neither, as in the map scores.
+    """
     seed, noise_std, (rays, stops, resolution) = job
     session = recorded(
         SessionOptions(seed=seed, stops=stops, lidar=Lidar(rays=rays, noise_std=noise_std)), resolution
@@ -55,7 +59,8 @@ def features(job: Job) -> tuple[Job, NDArray[np.float64], NDArray[np.bool_], NDA
     for scan, pose in session.scans:
         mapper.keep(scan, pose)
     fit = mapper.fit()
-    used = (session.truth.occupied | session.truth.free) & known(fit.certainty, fit.evidence)
+    free = session.truth.crossed if noise_std < resolution else session.truth.free
+    used = (session.truth.occupied | free) & known(fit.certainty, fit.evidence)
     own, near = (log_odds(array[used]) for array in behind_surface(fit.stopping, fit.certainty, fit.evidence))
     stopping = np.log(fit.stopping[used].astype(np.float64))
     log_noise = math.log(fit.noise.std / resolution)

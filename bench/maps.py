@@ -1,64 +1,127 @@
 """How good each mapper's maps are, per noise level: recorded sessions, the median of each score.
 
-    python -m bench.maps [--sessions 20] [--mappers det prob] [--update README.md]
+    python -m bench.maps [--sessions 50] [--update docs/forward.md] [--short README.md]
 
-Seeds 0, 1, ... are the sessions'; a session with another noise level has the same world and the same poses.
+Seeds 0, 1, ... are the sessions'; a session with another noise level has the same world and the same poses. Beside
+the mappers stand what could be made of prob: the Gaussian sensor model, told the true noise; and its log-odds, put
+right by a logistic regression for each noise level, on sessions of other seeds.
 """
 
 from __future__ import annotations
 
 import argparse
+import os
 import statistics
-import tempfile
-from collections import defaultdict
-from collections.abc import Iterable
+from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 
-from mapping.mapper import MAPPERS
-from prim.metrics import MapScores
+import numpy as np
+from numpy.typing import NDArray
+
+from bench.sessions import Session, recorded
+from mapping.mapper import Mapper, make_mapper
+from prim.metrics import MapScores, map_scores
 from recorder.sensors import Lidar
-from recorder.session import SessionOptions, record
-from replay.pipeline import Pipeline, ReplayOptions
+from recorder.session import SessionOptions
 
 NOISE_LEVELS = (0.0, 0.05, 0.075, 0.1, 0.25, 0.375, 0.5)
-COLUMNS = {
-    "occupied_f1": "F1",
-    "occupied_precision": "precision",
-    "occupied_recall": "recall",
-    "free_accuracy": "free",
-    "auc": "AUC",
-}
+ROWS = ("det", "prob", "prob, calibrated", "prob, Gaussian", "forward")
+COLUMNS = ("F1", "F1 within 3", "precision", "recall", "free", "AUC")
+CALIBRATION_SEED, CALIBRATION_SESSIONS = 30_000, 8
+
+Scores = tuple[float | None, ...]
+Line = tuple[float, float]
 
 
-def scores_of(sessions: int, noise_std: float, mappers: Iterable[str]) -> dict[str, list[MapScores]]:
-    """Each mapper's scores over the sessions."""
-    scores = defaultdict(list)
-    with tempfile.TemporaryDirectory() as folder:
-        for seed in range(sessions):
-            log = Path(folder) / "session.mcap"
-            record(log, SessionOptions(seed=seed, lidar=Lidar(noise_std=noise_std)))
-            for mapper in mappers:
-                result = Pipeline(log, ReplayOptions(mapper=mapper)).run()
-                assert result.scores is not None
-                scores[mapper].append(result.scores)
-    return scores
+def session_of(seed: int, noise_std: float) -> Session:
+    return recorded(SessionOptions(seed=seed, lidar=Lidar(noise_std=noise_std)))
 
 
-def median(scores: list[MapScores], name: str) -> str:
-    values = [value for score in scores if (value := getattr(score, name)) is not None]
-    return f"{statistics.median(values):.3f}" if values else "–"
+def probability(mapper: Mapper, session: Session) -> NDArray[np.float32]:
+    """The map of a session's scans."""
+    for scan, pose in session.scans:
+        mapper.update(scan, pose)
+    return mapper.finish().probability
 
 
-def table(sessions: int, mappers: list[str]) -> str:
-    lines = [
-        "| LiDAR noise σ | mapper | " + " | ".join(COLUMNS.values()) + " |",
-        "|---|---|" + "---|" * len(COLUMNS),
-    ]
+def odds_of(p: NDArray[np.float32]) -> NDArray[np.float64]:
+    clipped = np.clip(p.astype(np.float64), 1e-12, 1 - 1e-7)
+    return np.asarray(np.log(clipped / (1 - clipped)))
+
+
+def calibration(noise_std: float) -> Line:
+    """Intercept and slope of the logistic regression of truth on prob's log-odds."""
+    odds, truth = [], []
+    for seed in range(CALIBRATION_SEED, CALIBRATION_SEED + CALIBRATION_SESSIONS):
+        session = session_of(seed, noise_std)
+        assert session.truth is not None
+        p = probability(make_mapper("prob", 0.01, session.frame.bounds), session)
+        used = session.truth.occupied | session.truth.free
+        odds.append(odds_of(p[used]))
+        truth.append(session.truth.occupied[used])
+    x = np.column_stack((np.ones(sum(map(len, odds))), np.concatenate(odds)))
+    y = np.concatenate(truth).astype(float)
+    w = np.zeros(2)
+    for _ in range(30):
+        p = 1 / (1 + np.exp(-np.clip(x @ w, -40, 40)))
+        w += np.linalg.solve((x * (p * (1 - p) + 1e-9)[:, None]).T @ x + 1e-6 * np.eye(2), x.T @ (y - p))
+    return float(w[0]), float(w[1])
+
+
+def scores_of(job: tuple[int, float, Line]) -> dict[str, Scores]:
+    """Each row's scores of one session."""
+    seed, noise_std, (intercept, slope) = job
+    session = session_of(seed, noise_std)
+    bounds = session.frame.bounds
+    maps = {name: probability(make_mapper(name, 0.01, bounds), session) for name in ("det", "prob", "forward")}
+    maps["prob, calibrated"] = 1 / (1 + np.exp(-(intercept + slope * odds_of(maps["prob"]))))
+    gaussian = make_mapper("prob", 0.01, bounds, "gaussian", max(noise_std, 1e-3))
+    maps["prob, Gaussian"] = probability(gaussian, session)
+    assert session.truth is not None
+    occupied, free = session.truth.occupied, session.truth.free
+    return {
+        name: as_columns(map_scores(p, occupied, free), map_scores(p, occupied, free, 3)) for name, p in maps.items()
+    }
+
+
+def as_columns(one: MapScores, three: MapScores) -> Scores:
+    return (
+        one.occupied_f1,
+        three.occupied_f1,
+        one.occupied_precision,
+        one.occupied_recall,
+        one.free_accuracy,
+        one.auc,
+    )
+
+
+def median(values: list[float | None]) -> str:
+    known = [value for value in values if value is not None]
+    return f"{statistics.median(known):.3f}" if known else "–"
+
+
+def measure(sessions: int) -> dict[tuple[float, str], list[str]]:
+    """The medians of each noise level and row."""
+    medians = {}
+    with ProcessPoolExecutor(os.cpu_count()) as pool:
+        lines = list(pool.map(calibration, NOISE_LEVELS))
+        for noise_std, line in zip(NOISE_LEVELS, lines, strict=True):
+            jobs = [(seed, noise_std, line) for seed in range(sessions)]
+            found = list(pool.map(scores_of, jobs, chunksize=2))
+            for row in ROWS:
+                columns = zip(*(scores[row] for scores in found), strict=True)
+                medians[noise_std, row] = [median(list(column)) for column in columns]
+                print(noise_std, row, *medians[noise_std, row], flush=True)
+    return medians
+
+
+def table(medians: dict[tuple[float, str], list[str]], rows: tuple[str, ...], columns: tuple[str, ...]) -> str:
+    chosen = [COLUMNS.index(column) for column in columns]
+    lines = ["| LiDAR noise σ | mapper | " + " | ".join(columns) + " |", "|---|---|" + "---|" * len(columns)]
     for noise_std in NOISE_LEVELS:
-        for mapper, scores in scores_of(sessions, noise_std, mappers).items():
-            cells = " | ".join(median(scores, name) for name in COLUMNS)
-            lines.append(f"| {noise_std * 1000:g} mm | {mapper} | {cells} |")
-            print(lines[-1], flush=True)
+        for row in rows:
+            cells = " | ".join(medians[noise_std, row][k] for k in chosen)
+            lines.append(f"| {noise_std * 1000:g} mm | {row} | {cells} |")
     return "\n".join(lines)
 
 
@@ -71,10 +134,12 @@ def update(path: Path, name: str, content: str) -> None:
 
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    parser.add_argument("--sessions", type=int, default=20)
-    parser.add_argument("--mappers", nargs="+", default=list(MAPPERS))
-    parser.add_argument("--update", type=Path)
+    parser.add_argument("--sessions", type=int, default=50)
+    parser.add_argument("--update", type=Path, help="the document that gets the whole table")
+    parser.add_argument("--short", type=Path, help="the document that gets the short one")
     options = parser.parse_args()
-    made = table(options.sessions, options.mappers)
+    measured = measure(options.sessions)
     if options.update:
-        update(options.update, "bench-maps", made)
+        update(options.update, "bench-maps", table(measured, ROWS, COLUMNS))
+    if options.short:
+        update(options.short, "bench-maps", table(measured, ("det", "prob", "forward"), ("F1", "F1 within 3", "AUC")))

@@ -13,6 +13,9 @@ from prim.errors import UsageError
 from prim.world import Bounds
 
 UNKNOWN = np.float32(0.5)
+EVIDENCE_TOP = 10_000.0
+"""In an image, this many rays to a cell are white."""
+
 MAX_CELLS = 200_000_000
 """A grid of more cells is refused: it would not fit the memory of a laptop."""
 
@@ -106,6 +109,20 @@ class OccupancyGrid:
     def free(self) -> NDArray[np.bool_]:
         """Cells more likely free than not."""
         return self.probability < UNKNOWN
+
+    def image(self) -> NDArray[np.uint8]:
+        """What a detector sees (rows, cols, 3): probability of occupancy, evidence, and whether the cell is known.
+
+        The probability is 0 to 255; the evidence is logarithmic, 255 at EVIDENCE_TOP rays and more, and where the
+        mapper does not tell it, the same as the third: 255 where the cell is known, else 0. Row 0 at the smallest y.
+        """
+        known = np.where(self.occupied | self.free, np.uint8(255), np.uint8(0))
+        evidence = known
+        if self.evidence is not None:
+            scaled = np.log1p(self.evidence) * (255 / math.log1p(EVIDENCE_TOP))
+            evidence = np.clip(scaled, 0, 255).astype(np.uint8)
+        probability = np.rint(self.probability * 255).astype(np.uint8)
+        return np.stack((probability, evidence, known), axis=-1)
 
     def centres(self, cells: NDArray[np.bool_]) -> NDArray[np.float64]:
         """Centres (N, 2) in metres of the marked cells."""

@@ -51,10 +51,15 @@ class TruthMap:
         return self._occupied
 
     @property
+    def crossed(self) -> NDArray[np.bool_]:
+        """Cells that a ray crosses or ends in (rows, cols)."""
+        crossed: NDArray[np.bool_] = self._states != UNSEEN
+        return crossed
+
+    @property
     def free(self) -> NDArray[np.bool_]:
         """Cells that a ray crosses, more than one cell away from any occupied one (rows, cols)."""
-        crossed: NDArray[np.bool_] = self._states != UNSEEN
-        return crossed & ~dilate(self._occupied, 1)
+        return self.crossed & ~dilate(self._occupied, 1)
 
     def score(self, probability: NDArray[np.float32]) -> MapScores:
         """Scores of a map on the same frame."""

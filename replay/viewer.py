@@ -337,10 +337,8 @@ def _as_grid_map(grid: OccupancyGrid, values: NDArray[np.uint8], colormap: Any) 
 
 
 def _evidence_map(grid: OccupancyGrid) -> rr.GridMap:
-    """How many rays came to each cell, as grey on a logarithmic scale: black none, white 10,000 and more."""
-    assert grid.evidence is not None
-    grey = np.clip(np.log10(1 + grid.evidence) * (255 / 4), 0, 255).astype(np.uint8)
-    return _as_grid_map(grid, grey, None)
+    """How many rays came to each cell, as grey on a logarithmic scale: black for none."""
+    return _as_grid_map(grid, grid.image()[..., 1], None)
 
 
 def _index(times: Sequence[tuple[int, int]]) -> list[Any]:

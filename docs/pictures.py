@@ -1,0 +1,59 @@
+"""The picture of the mappers' maps at four noise levels: python -m docs.pictures docs/maps.png [--seed 10].
+
+Rows: det, prob, prob with the Gaussian sensor model (told the true noise), forward. White is free, black is
+occupied, grey unknown. The same world and poses in every column.
+"""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image, ImageDraw
+
+from bench.maps import probability, session_of
+from mapping.mapper import make_mapper
+
+NOISE = (0.0, 0.05, 0.25, 0.5)
+ROWS = {"det": "det", "prob": "prob", "prob, Gaussian": "gaussian", "forward": "forward"}
+GAP, LABEL = 6, 18
+
+
+def maps(seed: int) -> list[list[NDArray[np.uint8]]]:
+    """Grey images, rows of mappers, columns of noise; the largest y at the top."""
+    sessions = [session_of(seed, noise_std) for noise_std in NOISE]
+    rows = []
+    for kind in ROWS.values():
+        row = []
+        for session, noise_std in zip(sessions, NOISE, strict=True):
+            bounds = session.frame.bounds
+            if kind == "gaussian":
+                mapper = make_mapper("prob", 0.01, bounds, "gaussian", max(noise_std, 1e-3))
+            else:
+                mapper = make_mapper(kind, 0.01, bounds)
+            row.append(np.flipud(np.rint(255 * (1 - probability(mapper, session))).astype(np.uint8)))
+        rows.append(row)
+    return rows
+
+
+def draw(rows: list[list[NDArray[np.uint8]]]) -> Image.Image:
+    """All maps side by side, labelled."""
+    height, width = rows[0][0].shape
+    picture = Image.new("L", (len(NOISE) * (width + GAP) + GAP, len(rows) * (height + LABEL + GAP) + GAP), 215)
+    pen = ImageDraw.Draw(picture)
+    for i, (name, row) in enumerate(zip(ROWS, rows, strict=True)):
+        for j, (noise_std, image) in enumerate(zip(NOISE, row, strict=True)):
+            x, y = GAP + j * (width + GAP), GAP + i * (height + LABEL + GAP)
+            pen.text((x, y + 3), f"{name}, noise {noise_std * 1000:g} mm", fill=0)
+            picture.paste(Image.fromarray(image), (x, y + LABEL))
+    return picture
+
+
+if __name__ == "__main__":
+    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser.add_argument("picture", type=Path)
+    parser.add_argument("--seed", type=int, default=10)
+    options = parser.parse_args()
+    draw(maps(options.seed)).save(options.picture, optimize=True)
