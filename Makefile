@@ -7,7 +7,7 @@ NOISE_STD ?= 0.05
 
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
 
-.PHONY: demo test test-slow bench bench-maps lint format clean
+.PHONY: demo test test-slow bench bench-maps bench-forward lint format clean
 
 demo: .venv/installed
 	@mkdir -p demo
@@ -29,7 +29,12 @@ bench: .venv/installed
 	$(BIN)/python -m bench.speed --update docs/speed.md
 
 bench-maps: .venv/installed
-	$(BIN)/python -m bench.maps --update README.md
+	$(BIN)/python -m bench.maps --update docs/forward.md --short README.md
+
+bench-forward: .venv/installed
+	$(BIN)/python -m bench.forward --update docs/forward.md
+	$(BIN)/python -m bench.heldout --update docs/forward.md
+	$(BIN)/python -m bench.calibrate check --update docs/forward.md
 
 lint: .venv/installed-dev
 	$(BIN)/ruff check .

@@ -24,6 +24,9 @@ LEAST_EVIDENCE = 0.5
 FULL_EVIDENCE = 5.0
 """In a neighbourhood, cells with more evidence than this count the same."""
 
+LEAST_SPREAD, MOST_SPREAD = 0.5, 60.0
+"""The noise, in cells, for which the regression holds; smaller and larger noise counts as this."""
+
 CLIP = 1e-6
 """Chances are kept this far from 0 and 1."""
 
@@ -70,7 +73,7 @@ def occupancy(
     """
     chance, around = behind_surface(stopping, certainty, evidence)
     probability = np.empty_like(stopping)
-    log_noise = math.log(noise_cells)
+    log_noise = math.log(min(max(noise_cells, LEAST_SPREAD), MOST_SPREAD))
     weights = COEFFICIENTS @ (1.0, log_noise, log_noise**2)
     _logistic(chance, around, stopping, certainty * evidence, weights, probability)
     return probability

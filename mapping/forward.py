@@ -33,7 +33,7 @@ TOLERANCE, COARSE_TOLERANCE = 5e-4, 2e-3
 COARSEST = 8
 """The largest factor between the first level's cells and the map's."""
 
-PASSES = {1: 12, 2: 10, 4: 10, 8: 10}
+PASSES = {1: 12, 2: 10, 4: 16, 8: 16}
 """At most so many passes on the level whose cells are larger by a factor."""
 
 POWER = 3

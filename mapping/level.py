@@ -53,6 +53,12 @@ LEAST_NOISE = 0.15
 COLUMNS = 3
 """Sums are kept of hits, of passes and, where it is asked for, of how certain those are."""
 
+MOST_NOISE = 5.0
+"""Nor as larger than this (m)."""
+
+LEAST_STOPS = 5.0
+"""Nothing is learned about the noise from fewer rays that were stopped."""
+
 FARTHEST = 1000.0
 """A sensor without a range_max is taken to see this far (m)."""
 
@@ -85,11 +91,11 @@ class Totals:
 
     def noise(self, before: Noise, resolution: float) -> Noise:
         """The M step of the noise."""
-        if not self.rays or not self.stops:
+        if self.stops < LEAST_STOPS:
             return before
         std = before.std * math.sqrt(self.squares / self.stops)
         wild = min(max(self.wild / self.rays, LEAST_WILD), MOST_WILD)
-        return Noise(max(std, LEAST_NOISE * resolution), wild)
+        return Noise(min(max(std, LEAST_NOISE * resolution), MOST_NOISE), wild)
 
 
 class Rays:

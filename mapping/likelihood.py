@@ -23,14 +23,13 @@ ONE = float(1 << SHIFT)
 FAR_CELLS = float(1 << 20)
 """A ray that starts further off the grid is not followed."""
 
-REACH = 5.0
+REACH = 6.0
 """Beyond this many standard deviations the Gaussian is nothing."""
 
-SPACING = 128
+SPACING = 64
 """Entries per standard deviation in the tables."""
 
 TOP = int(2 * REACH * SPACING)
-MIDDLE = REACH * SPACING + 0.5
 
 CUT = REACH**2 / 512
 """Where the Gaussian ends, in x^2 / 512."""
@@ -89,12 +88,12 @@ def normal_cdf_integral(u: float) -> float:
 
 
 @inline
-def looked_up(table: Any, u: float) -> float:
-    """Phi(u) from the table, linear between its entries."""
-    place = (REACH - min(max(u, -REACH), REACH)) * SPACING
+def looked_up(table: Any, row: int, x: float) -> float:
+    """A row of the table at x, linear between its entries."""
+    place = min(max(x + REACH, 0.0), 2 * REACH) * SPACING
     entry = min(int(place), TOP - 1)
-    low = float(table[TOO_NEAR, entry])
-    return low + (place - entry) * (float(table[TOO_NEAR, entry + 1]) - low)
+    low = float(table[row, entry])
+    return low + (place - entry) * (float(table[row, entry + 1]) - low)
 
 
 @inline
@@ -108,7 +107,11 @@ def beyond(kind: int, z: float, z_min: float, z_max: float, exit_at: float, sigm
         return 1.0 if kind == NO_RETURN else 0.0
     span = z_max - exit_at
     if kind == MEASURED:
-        return BEYOND * (looked_up(table, (z - exit_at) / sigma) - looked_up(table, (z - z_max) / sigma)) / span
+        return (
+            BEYOND
+            * (looked_up(table, NO_RETURN, (z - exit_at) / sigma) - looked_up(table, NO_RETURN, (z - z_max) / sigma))
+            / span
+        )
     if kind == TOO_NEAR:
         near = normal_cdf_integral((z_min - exit_at) / sigma) - normal_cdf_integral((z_min - z_max) / sigma)
         return BEYOND * sigma * near / span
@@ -226,16 +229,10 @@ def weigh_cut(row: int, count: int, where: Any, chance: Any, apart: Any, flat: A
     total = np.float32(0)
     for i in range(count):
         n = np.uintp(i)
-        part = chance[n] * flat[np.uintp(where[n])] * table[row, entry_of(apart[n])]
+        part = chance[n] * flat[np.uintp(where[n])] * np.float32(looked_up(table, row, apart[n]))
         share[n] = part
         total += part
     return total
-
-
-@inline
-def entry_of(x: float) -> int:
-    """The table's entry for x = (s - z) / sigma."""
-    return min(max(int(x * np.float32(SPACING) + np.float32(MIDDLE)), 0), TOP)
 
 
 @fast
@@ -260,7 +257,7 @@ def moments_cut(row: int, count: int, factor: Any, share: Any, apart: Any, table
         q = share[n] * factor
         share[n] = q
         stops += q
-        squares += q * table[row, entry_of(apart[n])]
+        squares += q * np.float32(looked_up(table, row, apart[n]))
     return stops, squares
 
 

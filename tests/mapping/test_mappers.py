@@ -11,7 +11,13 @@ from hypothesis import strategies as st
 from mapping.deterministic import DeterministicMapper
 from mapping.grid import OccupancyGrid
 from mapping.mapper import MAPPERS, make_mapper
-from mapping.probabilistic import ProbabilisticMapper, inverse_sensor_model, log_odds, probability_of
+from mapping.probabilistic import (
+    ProbabilisticMapper,
+    gaussian_sensor_model,
+    inverse_sensor_model,
+    log_odds,
+    probability_of,
+)
 from mapping.truth import TruthMap
 from prim.errors import UsageError
 from prim.frames import Pose2D, Scan
@@ -253,3 +259,22 @@ def test_truth_of_an_empty_room_is_its_walls() -> None:
     assert np.abs(np.abs(centres).max(axis=1) - 1.0).max() <= 0.0051
     assert np.abs(mapper.grid().centres(truth.free)).max() < 0.99
     assert not (truth.occupied & truth.free).any()
+
+
+def test_the_gaussian_sensor_model() -> None:
+    std = 0.2
+    assert gaussian_sensor_model(0.0, std) == pytest.approx(0.9)
+    at_one = math.exp(-0.5)
+    assert gaussian_sensor_model([-std, std], std) == pytest.approx([0.3 + 0.6 * at_one, 0.5 + 0.4 * at_one])
+    assert gaussian_sensor_model([-10.0, 10.0], std) == pytest.approx([0.3, 0.5])
+
+
+def test_the_gaussian_map_is_the_model_along_a_ray() -> None:
+    mapper = make_mapper("prob", 0.01, (-0.005, -0.1, 2.0, 0.1), "gaussian", 0.1)
+    mapper.update(Scan(0, "laser", 0.0, 0.1, 0.03, 5.0, np.array([1.0], np.float32)), Pose2D())
+    grid = mapper.grid()
+    x = (np.arange(grid.frame.cols) + grid.frame.col + 0.5) * 0.01
+    within = (x > 0.02) & (x < 1.38)
+    found = row_at(grid, 0.005)
+    assert found[within] == pytest.approx(gaussian_sensor_model(x[within] - 1.0, 0.1), abs=2e-3)
+    assert (found[x > 1.45] == 0.5).all()

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from mapping.mapper import MAPPERS
 from prim import console
 from recorder.session import Session
 from replay.cli import app, join_bounds
@@ -35,7 +36,7 @@ def report_of(path: str) -> dict[str, Any]:
     return parsed
 
 
-@pytest.mark.parametrize("mapper", ["det", "prob"])
+@pytest.mark.parametrize("mapper", MAPPERS)
 def test_a_plain_replay_leaves_a_recording_and_a_report(replay: Run, noisy_session: Session, mapper: str) -> None:
     code, out, err = replay(noisy_session.path, "--mapper", mapper)
     assert (code, err) == (0, "")
@@ -56,7 +57,13 @@ def test_a_plain_replay_leaves_a_recording_and_a_report(replay: Run, noisy_sessi
     assert report["map"]["mapper"] == mapper
     assert report["map"]["origin_m"] == pytest.approx([-1.1, -1.1])
     assert report["map"]["cells"] == [220, 220]
-    assert report["map"]["noise_std_m"] is None
+    if mapper == "forward":
+        assert report["map"]["noise_std_m"] == pytest.approx(0.05, rel=0.1)
+        quartiles = report["map"]["evidence"]["rays_per_cell_quartiles"]
+        assert report["map"]["evidence"]["cells_known"] > 10_000 and quartiles == sorted(quartiles)
+        assert "range noise" in out
+    else:
+        assert report["map"]["noise_std_m"] is report["map"]["evidence"] is None
     assert set(report["map"]["scores"]) == {
         *("occupied_precision", "occupied_recall", "occupied_f1", "free_accuracy", "auc")
     }
@@ -245,6 +252,16 @@ def test_a_truncated_log_is_refused_and_salvaged_with_exit_code_3(replay: Run, n
     assert (log["recovered"], log["messages_lost"], log["scans"]) == (True, None, noisy_session.scans)
 
 
+@pytest.mark.parametrize(("noise", "expected"), [([], 0.05), (["--noise-std", "0.2"], 0.2)])
+@pytest.mark.parametrize("kind", [["--sensor-model", "gaussian"], ["--mapper", "forward"]])
+def test_the_noise_is_given_or_found(
+    replay: Run, noisy_session: Session, kind: list[str], noise: list[str], expected: float
+) -> None:
+    assert replay(noisy_session.path, "--no-viewer", "--report", "a.json", *kind, *noise)[0] == 0
+    found = report_of("a.json")["map"]["noise_std_m"]
+    assert found == pytest.approx(expected, rel=0.1 if not noise else 1e-9)
+
+
 @pytest.mark.parametrize(
     ("options", "said"),
     [
@@ -266,6 +283,12 @@ def test_a_truncated_log_is_refused_and_salvaged_with_exit_code_3(replay: Run, n
         (["--rate", "0"], "--rate"),
         (["--map-every", "0"], "--map-every"),
         (["--mapper", "magic"], "--mapper"),
+        (["--noise-std", "0.1"], "--noise-std goes with --mapper forward"),
+        (["--mapper", "det", "--noise-std", "0.1"], "--noise-std goes with --mapper forward"),
+        (["--mapper", "forward", "--noise-std", "0"], "--noise-std"),
+        (["--mapper", "forward", "--noise-std", "nan"], "--noise-std"),
+        (["--mapper", "forward", "--sensor-model", "gaussian"], "--sensor-model goes with --mapper prob"),
+        (["--sensor-model", "magic"], "--sensor-model"),
         (["--pose", "magic"], "--pose"),
         (["--standing-still", "--pose", "tf"], "exclude"),
         (["--no-viewer", "--save", "a.rrd"], "excludes"),

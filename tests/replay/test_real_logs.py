@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from mapping.mapper import MAPPERS
 from prim import console
 from prim.frames import Pose2D
 from prim.raycast import FloatArray
@@ -15,7 +16,7 @@ from replay.cli import app
 from replay.pipeline import Pipeline, ReplayOptions, ReplayResult
 
 Find = Callable[[str], Path]
-both = pytest.mark.parametrize("mapper", ["det", "prob"])
+every = pytest.mark.parametrize("mapper", MAPPERS)
 
 
 def fit_circle(points: FloatArray) -> tuple[float, float, float]:
@@ -29,7 +30,7 @@ def pillars(path: Path, mapper: str) -> ReplayResult:
     return Pipeline(path, ReplayOptions(mapper=mapper, laser_offset=Pose2D(-0.032, 0, 0))).run()
 
 
-@both
+@every
 def test_four_round_pillars_in_a_square_room(real_log: Find, mapper: str) -> None:
     result = pillars(real_log("pillars4.mcap"), mapper)
     assert result.poses.source == "odom"
@@ -46,7 +47,7 @@ def test_four_round_pillars_in_a_square_room(real_log: Find, mapper: str) -> Non
     assert np.mean(distances < 0.25) > 0.95
 
 
-@both
+@every
 def test_the_rooms_four_walls(real_log: Find, mapper: str) -> None:
     """Half of the outermost cells' median on each side stands where the wall is."""
     result = pillars(real_log("pillars4.mcap"), mapper)
@@ -64,7 +65,7 @@ def test_without_the_offset_the_mount_is_asked_for(real_log: Find) -> None:
     assert any("--laser-offset" in note for note in result.notes)
 
 
-@both
+@every
 def test_the_csail_floor_plan(real_log: Find, mapper: str) -> None:
     """The known size of the floor; corridors free, straight walls; no poses lost."""
     result = Pipeline(real_log("csail.mcap"), ReplayOptions(mapper=mapper, resolution=0.05)).run()
@@ -77,8 +78,24 @@ def test_the_csail_floor_plan(real_log: Find, mapper: str) -> None:
         row, col = (np.array([y - y0, x - x0]) / 0.05).astype(int)
         assert grid.free[row - 1 : row + 2, col - 1 : col + 2].mean() > 0.5
     assert 3_000 < np.count_nonzero(grid.occupied) < 30_000
-    odom = Pipeline(real_log("csail.mcap"), ReplayOptions(mapper=mapper, resolution=0.05, pose="odom")).run()
-    assert odom.poses.poses == pytest.approx(result.poses.poses, abs=1e-6)
+
+
+def test_csail_s_odometry_and_transforms_agree(real_log: Find) -> None:
+    tf, odom = (
+        Pipeline(real_log("csail.mcap"), ReplayOptions(resolution=0.5, pose=pose)).run().poses.poses
+        for pose in ("tf", "odom")
+    )
+    assert odom == pytest.approx(tf, abs=1e-6)
+
+
+def test_forward_tells_glass_from_walls(real_log: Find) -> None:
+    """The hall in the middle of the floor is seen through its railing: free, but for the railing itself."""
+    result = Pipeline(real_log("csail.mcap"), ReplayOptions(mapper="forward", resolution=0.05)).run()
+    assert result.noise_std == pytest.approx(0.032, abs=0.01)
+    x0, y0, _, _ = result.grid.frame.bounds
+    row, col = round((-5.6 - y0) / 0.05), round((11.7 - x0) / 0.05)
+    hall = slice(row - 20, row + 20), slice(col - 20, col + 20)
+    assert result.grid.free[hall].mean() > 0.9
 
 
 @pytest.fixture
@@ -103,7 +120,7 @@ def test_two_scanners_and_no_poses(real_log: Find, failing: Callable[..., str]) 
     assert "its scan topics: /front_scan, /rear_scan" in failing(path, "--scan-topic", "/scan")
 
 
-@both
+@every
 def test_a_scanner_that_stands_still(real_log: Find, in_tmp: Path, mapper: str) -> None:
     path = real_log("hokuyo_two_scanners.mcap")
     arguments = [str(path), "--scan-topic", "/front_scan", "--standing-still", "--mapper", mapper, "--quiet"]
