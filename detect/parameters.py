@@ -1,0 +1,122 @@
+"""From a box to a primitive's parameters: the crop that a network sees, and what its outputs mean.
+
+Two ways of doing it, one for each preset:
+
+- ``paper`` (III-C): the box is cut out and put in the middle of an empty canvas of 200 x 200 cells, which is shrunk
+  to 50 x 50; the outputs are the parameters themselves.
+- ``prim``: a window of 72 x 72 cells around the box's centre, at the map's own resolution, with what lies around the
+  primitive left in; an angle is two outputs, the cosine and the sine of the angle times the kind's symmetry, so that
+  no angle is torn apart where it wraps around.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from prim.shapes import Kind, Primitive
+
+Box = tuple[float, float, float, float]
+"""Left, top, right, bottom in cells of a tile; row 0 at the top."""
+
+LONGEST = 0.4
+"""Sizes (m) are outputs in units of this."""
+
+TURNS = {Kind.SQUARE: 4, Kind.RECTANGLE: 2, Kind.TRIANGLE: 1, Kind.ELLIPSE: 2}
+"""How many times a kind looks the same in one turn; a circle has no angle."""
+
+SIZES = {Kind.SQUARE: 1, Kind.RECTANGLE: 2, Kind.CIRCLE: 1, Kind.TRIANGLE: 2, Kind.ELLIPSE: 2}
+"""How many sizes a kind has."""
+
+UNKNOWN = 128
+
+
+@dataclass(frozen=True)
+class Preset:
+    """How crops are made and outputs are read.
+
+    ``window`` cells around the box's centre become ``pixels`` x ``pixels``; ``isolated`` leaves only the box in it;
+    ``vector`` makes two outputs of an angle.
+    """
+
+    name: str
+    window: int
+    pixels: int
+    isolated: bool
+    vector: bool
+
+    def outputs(self, kind: Kind) -> int:
+        """How many numbers the kind's network gives."""
+        angle = 0 if kind not in TURNS else 2 if self.vector else 1
+        return angle + SIZES[kind]
+
+
+PAPER = Preset("paper", 200, 50, isolated=True, vector=False)
+PRIM = Preset("prim", 72, 72, isolated=False, vector=True)
+PRESETS = {preset.name: preset for preset in (PAPER, PRIM)}
+
+
+def crop(image: NDArray[np.uint8], box: Box, preset: Preset) -> NDArray[np.uint8]:
+    """The part (pixels, pixels) of a grey image (rows, cols) that a network sees; unknown beyond the image."""
+    rows, cols = image.shape
+    left, top, right, bottom = box
+    col, row = round((left + right) / 2 - preset.window / 2), round((top + bottom) / 2 - preset.window / 2)
+    window = np.full((preset.window, preset.window), UNKNOWN, np.uint8)
+    first_col, last_col, first_row, last_row = col, col + preset.window, row, row + preset.window
+    if preset.isolated:
+        first_col, last_col = max(first_col, math.floor(left) - 1), min(last_col, math.ceil(right) + 1)
+        first_row, last_row = max(first_row, math.floor(top) - 1), min(last_row, math.ceil(bottom) + 1)
+    first_col, last_col = max(first_col, 0), min(last_col, cols)
+    first_row, last_row = max(first_row, 0), min(last_row, rows)
+    if first_col < last_col and first_row < last_row:
+        part = image[first_row:last_row, first_col:last_col]
+        window[first_row - row : last_row - row, first_col - col : last_col - col] = part
+    return shrink(window, preset.pixels)
+
+
+def shrink(window: NDArray[np.uint8], pixels: int) -> NDArray[np.uint8]:
+    """A square image made smaller by a whole factor: each pixel is the mean of the cells in it."""
+    factor = len(window) // pixels
+    if factor == 1:
+        return window
+    blocks = window.reshape(pixels, factor, pixels, factor).astype(np.float32)
+    return np.asarray(np.rint(blocks.mean(axis=(1, 3))), dtype=np.uint8)
+
+
+def targets(primitive: Primitive, preset: Preset) -> NDArray[np.float32]:
+    """What a network should give for a primitive: its angle's outputs, then its sizes in units of LONGEST."""
+    values: list[float] = []
+    turns = TURNS.get(primitive.kind)
+    if turns is not None:
+        theta = primitive.theta or 0.0
+        period = 2 * math.pi / turns
+        values = [math.cos(turns * theta), math.sin(turns * theta)] if preset.vector else [theta % period / period]
+    return np.array([*values, *(size / LONGEST for size in primitive.size)], dtype=np.float32)
+
+
+def read_outputs(kind: Kind, outputs: Sequence[float], preset: Preset) -> tuple[float | None, tuple[float, ...]]:
+    """Angle (rad, None for a circle) and sizes (m, at least a millimetre) from a network's outputs."""
+    turns = TURNS.get(kind)
+    theta = None
+    if turns is not None:
+        period = 2 * math.pi / turns
+        turned = math.atan2(outputs[1], outputs[0]) / turns if preset.vector else outputs[0] * period
+        theta = turned % period
+    sizes = outputs[preset.outputs(kind) - SIZES[kind] : preset.outputs(kind)]
+    return theta, tuple(max(float(size) * LONGEST, 0.001) for size in sizes)
+
+
+def placed(kind: Kind, box_centre: tuple[float, float], theta: float | None, size: tuple[float, ...]) -> Primitive:
+    """The primitive whose outline's box has its centre (m) where the detected box has it.
+
+    A triangle's centroid, for one, is not the middle of its box.
+    """
+    at_origin = Primitive(kind, 0.0, 0.0, theta, size).canonical()
+    outline = at_origin.outline()
+    middle = (outline.min(axis=0) + outline.max(axis=0)) / 2
+    x, y = box_centre[0] - float(middle[0]), box_centre[1] - float(middle[1])
+    return Primitive(at_origin.kind, x, y, at_origin.theta, at_origin.size)

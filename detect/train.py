@@ -1,0 +1,226 @@
+"""Training: YOLOv5 through ultralytics, and the networks of detect.networks; checkpoints, resumable.
+
+Needs the extra ``[train]`` (torch, ultralytics). Nothing that replays imports this.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from detect.crops import Crops, gather
+from detect.dataset import samples
+from detect.networks import ParameterNetwork
+from detect.parameters import PAPER, PRESETS, PRIM
+from prim.errors import UsageError
+from prim.shapes import Kind
+
+Progress = Callable[[int, int, float, float], None]
+"""Told after each epoch: epochs done, epochs in all, loss on the training and on the validation split."""
+
+
+@dataclass(frozen=True)
+class CnnOptions:
+    """How one kind's network is trained. Raises UsageError on what cannot be."""
+
+    preset: str = PRIM.name
+    epochs: int = 60
+    batch: int = 128
+    learning_rate: float = 0.001
+    channels: int = 1
+    vary: bool = True
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        if self.preset not in PRESETS:
+            raise UsageError(f"there is no preset {self.preset!r}: choose from {', '.join(PRESETS)}")
+        if self.epochs < 1 or self.batch < 1 or not self.learning_rate > 0:
+            raise UsageError("epochs, batch and learning rate must be above 0")
+        if self.channels not in (1, 3):
+            raise UsageError(f"{self.channels} channels: grey has 1, the paper's images 3")
+
+
+CNN_PRESETS = {PRIM.name: CnnOptions(), PAPER.name: CnnOptions(PAPER.name, epochs=20, vary=False)}
+"""Ours; and the paper's (IV-B: 20 epochs, batch 128, Adam, learning rate 0.001, the crops as they are)."""
+
+
+def train_cnn(
+    data: Path, mapper: str, kind: Kind, output: Path, options: CnnOptions, progress: Progress | None = None
+) -> ParameterNetwork:
+    """Trains one kind's network on a set, and keeps a checkpoint at ``output`` after each epoch; goes on from one.
+
+    The loss is the mean squared error of the outputs. Raises UsageError where the set holds no primitive of the kind,
+    or the checkpoint is one of other options.
+    """
+    torch.manual_seed(options.seed)
+    training, validation = (gather(samples(data, mapper, split), kind) for split in ("train", "val"))
+    if not len(training):
+        raise UsageError(f"{data} holds no {kind} to learn from")
+    network = ParameterNetwork(kind, PRESETS[options.preset], options.channels)
+    optimizer = torch.optim.Adam(network.parameters(), lr=options.learning_rate)
+    schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, options.epochs)
+    first = _resume(output, options, network, optimizer, schedule)
+    for epoch in range(first, options.epochs):
+        rng = np.random.default_rng((options.seed, epoch))
+        loss = _epoch(network, optimizer, training, options, rng)
+        if options.vary:
+            schedule.step()
+        _keep(output, options, network, optimizer, schedule, epoch + 1)
+        if progress:
+            progress(epoch + 1, options.epochs, loss, evaluate_cnn(network, validation))
+    network.eval()
+    return network
+
+
+def _epoch(
+    network: ParameterNetwork,
+    optimizer: torch.optim.Optimizer,
+    crops: Crops,
+    options: CnnOptions,
+    rng: np.random.Generator,
+) -> float:
+    """One pass over all crops in random order; returns the mean loss."""
+    network.train()
+    preset = network.preset
+    order, total = rng.permutation(len(crops)), 0.0
+    for begin in range(0, len(order), options.batch):
+        chosen = order[begin : begin + options.batch]
+        if len(chosen) < 2:  # batch normalisation needs two
+            continue
+        pairs = [crops.varied(i, preset, rng) if options.vary else crops.exact(i, preset) for i in chosen.tolist()]
+        loss = torch.nn.functional.mse_loss(network(as_input(pairs, network.channels)), _wanted(pairs))
+        optimizer.zero_grad()
+        loss.backward()
+        optimizer.step()
+        total += float(loss.detach()) * len(chosen)
+    return total / len(order)
+
+
+def evaluate_cnn(network: ParameterNetwork, crops: Crops, batch: int = 256) -> float:
+    """The mean loss over all crops at their true boxes; 0 where there are none."""
+    network.eval()
+    total = 0.0
+    with torch.no_grad():
+        for begin in range(0, len(crops), batch):
+            pairs = [crops.exact(i, network.preset) for i in range(begin, min(begin + batch, len(crops)))]
+            outputs = network(as_input(pairs, network.channels))
+            total += float(torch.nn.functional.mse_loss(outputs, _wanted(pairs))) * len(pairs)
+    return total / max(len(crops), 1)
+
+
+def as_input(pairs: list[tuple[Any, Any]], channels: int) -> torch.Tensor:
+    """Crops as the network takes them: (N, channels, pixels, pixels) in 0 to 1."""
+    grey = torch.from_numpy(np.stack([made for made, _ in pairs])).float().div_(255).unsqueeze(1)
+    return grey.expand(-1, channels, -1, -1)
+
+
+def _wanted(pairs: list[tuple[Any, Any]]) -> torch.Tensor:
+    return torch.from_numpy(np.stack([wanted for _, wanted in pairs]))
+
+
+def _keep(output: Path, options: CnnOptions, network: Any, optimizer: Any, schedule: Any, epochs: int) -> None:
+    """Writes a checkpoint; whole, or not at all."""
+    part = output.with_suffix(".part")
+    state = {
+        "options": asdict(options),
+        "kind": network.kind.value,
+        "epochs": epochs,
+        "network": network.state_dict(),
+        "optimizer": optimizer.state_dict(),
+        "schedule": schedule.state_dict(),
+    }
+    torch.save(state, part)
+    part.replace(output)
+
+
+def _resume(output: Path, options: CnnOptions, network: Any, optimizer: Any, schedule: Any) -> int:
+    """Takes over a checkpoint where there is one; returns how many epochs it has seen."""
+    if not output.exists():
+        return 0
+    state = torch.load(output, weights_only=True)
+    if state["options"] != asdict(options) or state["kind"] != network.kind.value:
+        raise UsageError(f"{output} was trained with other options: give another file")
+    network.load_state_dict(state["network"])
+    optimizer.load_state_dict(state["optimizer"])
+    schedule.load_state_dict(state["schedule"])
+    return int(state["epochs"])
+
+
+@dataclass(frozen=True)
+class YoloOptions:
+    """How YOLOv5 is trained: from its yaml, or from a user's weights (which can run code: say so with ``trust``)."""
+
+    model: str = "yolov5n.yaml"
+    start: Path | None = None
+    trust: bool = False
+    epochs: int = 100
+    batch: int = 32
+    image_size: int = 224
+    optimizer: str = "AdamW"
+    learning_rate: float = 0.002
+    augment: bool = True
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        if self.start is not None and not self.trust:
+            raise UsageError(
+                f"{self.start} is a pickle, which can run code: add --trust if you know where it is from"
+            )
+
+
+YOLO_PRESETS = {
+    "prim": YoloOptions(),
+    "paper": YoloOptions(epochs=32, image_size=224, optimizer="SGD", learning_rate=0.01, augment=False),
+}
+"""Ours; and the paper's (IV-B: 32 epochs, batch 32, SGD, learning rate 0.01)."""
+
+
+def train_yolo(data: Path, mapper: str, output: Path, options: YoloOptions) -> Path:
+    """Trains YOLOv5 on a set and leaves its best weights in ``output``; goes on from an interrupted run there.
+
+    Images are turned and mirrored where ``augment`` is set, and never coloured: a map has no colours to vary. Raises
+    UsageError where the set is missing.
+    """
+    config = data / f"{mapper}.yaml"
+    if not config.exists():
+        raise UsageError(f"{data} holds no set for {mapper}: make one with prim-train dataset")
+    os.environ["YOLO_AUTOINSTALL"] = "false"
+    from ultralytics import YOLO, settings
+
+    settings.update({"sync": False})
+    last = output / "weights" / "last.pt"
+    if last.exists():
+        YOLO(str(last)).train(resume=True)
+        return output / "weights" / "best.pt"
+    model = YOLO(options.model)
+    if options.start is not None:
+        model.load(str(options.start))
+    turns = {"degrees": 180.0, "flipud": 0.5, "fliplr": 0.5} if options.augment else {"flipud": 0.0, "fliplr": 0.0}
+    model.train(
+        data=str(config),
+        epochs=options.epochs,
+        batch=options.batch,
+        imgsz=options.image_size,
+        optimizer=options.optimizer,
+        lr0=options.learning_rate,
+        seed=options.seed,
+        deterministic=True,
+        project=str(output.parent.resolve()),
+        name=output.name,
+        exist_ok=True,
+        pretrained=False,
+        plots=False,
+        verbose=False,
+        hsv_h=0.0,
+        hsv_s=0.0,
+        hsv_v=0.0,
+        mosaic=1.0 if options.augment else 0.0,
+        **turns,
+    )
+    return output / "weights" / "best.pt"
