@@ -1,0 +1,137 @@
+"""Crops and outputs: what a network sees, what its numbers mean, and that turning both agrees."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+import shapely
+from hypothesis import given
+from hypothesis import strategies as st
+
+from detect.crops import Crops, mirrored, turned
+from detect.dataset import TILE, box_of, cut, share_inside, tiles, yolo_line
+from detect.parameters import LONGEST, PAPER, PRIM, Preset, crop, placed, read_outputs, targets
+from mapping.grid import GridFrame, OccupancyGrid
+from prim.shapes import Kind, Primitive, angle_error
+from prim.world import World
+
+FRAME = GridFrame(0.01, -112, -112, TILE, TILE)
+SHAPES = [
+    Primitive(Kind.SQUARE, 0.1, -0.2, 0.4, (0.2,)),
+    Primitive(Kind.RECTANGLE, 0.1, -0.2, 0.4, (0.3, 0.15)),
+    Primitive(Kind.CIRCLE, 0.1, -0.2, None, (0.2,)),
+    Primitive(Kind.TRIANGLE, 0.1, -0.2, 2.0, (0.2, 0.25)),
+    Primitive(Kind.ELLIPSE, 0.1, -0.2, 2.4, (0.15, 0.06)),
+]
+every_shape = pytest.mark.parametrize("shape", SHAPES, ids=lambda shape: shape.kind.value)
+every_preset = pytest.mark.parametrize("preset", [PAPER, PRIM], ids=lambda preset: preset.name)
+
+
+def drawn(primitive: Primitive) -> np.ndarray:
+    """A primitive as a solid grey image of the tile."""
+    cells = (np.arange(TILE) - 112 + 0.5) * 0.01
+    x, y = np.meshgrid(cells, cells)
+    inside = shapely.contains_xy(shapely.Polygon(primitive.outline(256)), x, y)
+    return np.where(inside, np.uint8(255), np.uint8(0))
+
+
+@every_shape
+@every_preset
+def test_outputs_are_read_as_they_were_meant(shape: Primitive, preset: Preset) -> None:
+    outputs = targets(shape, preset)
+    assert len(outputs) == preset.outputs(shape.kind)
+    theta, size = read_outputs(shape.kind, outputs.tolist(), preset)
+    assert size == pytest.approx(shape.size, abs=1e-6)
+    found = Primitive(shape.kind, 0, 0, theta, size)
+    assert angle_error(found, shape) in (None, pytest.approx(0, abs=1e-5))
+
+
+def test_the_paper_s_outputs_and_ours() -> None:
+    assert [PAPER.outputs(shape.kind) for shape in SHAPES] == [2, 3, 1, 3, 3]
+    assert [PRIM.outputs(shape.kind) for shape in SHAPES] == [3, 4, 1, 4, 4]
+    assert targets(SHAPES[2], PAPER) == pytest.approx([0.2 / LONGEST])
+
+
+@every_shape
+def test_a_primitive_is_put_where_its_box_is(shape: Primitive) -> None:
+    outline = shape.outline()
+    middle = (outline.min(axis=0) + outline.max(axis=0)) / 2
+    found = placed(shape.kind, (float(middle[0]), float(middle[1])), shape.theta, shape.size)
+    assert (found.x, found.y) == pytest.approx((shape.x, shape.y), abs=1e-9)
+
+
+@every_shape
+def test_the_box_is_around_what_is_drawn(shape: Primitive) -> None:
+    rows, cols = np.nonzero(drawn(shape))
+    left, top, right, bottom = box_of(shape, FRAME)
+    assert (left, top, right, bottom) == pytest.approx(
+        (cols.min(), rows.min(), cols.max() + 1, rows.max() + 1), abs=1.01
+    )
+    kind, cx, cy, w, h = (float(value) for value in yolo_line(shape, FRAME).split())
+    assert kind == list(Kind).index(shape.kind)
+    assert ((cx - w / 2) * TILE, (cy + h / 2) * TILE) == pytest.approx((left, bottom), abs=1e-3)
+
+
+@every_shape
+@pytest.mark.parametrize("seed", range(8))
+def test_what_varies_a_crop_varies_its_parameters(shape: Primitive, seed: int) -> None:
+    """A crop that was mirrored and turned shows the primitive that its targets describe."""
+    crops = Crops(shape.kind, (drawn(shape),), ((0, box_of(shape, FRAME), shape),), 0.01)
+    made, outputs = crops.varied(0, PRIM, np.random.default_rng(seed))
+    theta, size = read_outputs(shape.kind, outputs.tolist(), PRIM)
+    told = placed(shape.kind, (0.0, 0.0), theta, size)
+    expected = crop(drawn(told), box_of(told, FRAME), PRIM)
+    shifts = [  # the jitter moves the box by a few cells
+        np.count_nonzero(np.roll(made, (dy, dx), (0, 1)) != expected) for dy in range(-4, 5) for dx in range(-4, 5)
+    ]
+    assert min(shifts) / np.count_nonzero(expected) < 0.08
+
+
+@given(theta=st.floats(0, 6.28), quarters=st.integers(0, 3))
+def test_turning_and_mirroring_twice_is_nothing(theta: float, quarters: int) -> None:
+    for kind, size in ((Kind.TRIANGLE, (0.2, 0.15)), (Kind.ELLIPSE, (0.2, 0.1)), (Kind.SQUARE, (0.2,))):
+        shape = Primitive(kind, 0, 0, theta, size).canonical()
+        for again in (mirrored(mirrored(shape)), turned(turned(shape, quarters), 4 - quarters)):
+            assert angle_error(again, shape) == pytest.approx(0, abs=1e-6)
+
+
+def test_the_papers_crop_is_alone_on_its_canvas() -> None:
+    image = np.full((TILE, TILE), 255, np.uint8)
+    made = crop(image, (100.0, 90.0, 120.0, 130.0), PAPER)
+    assert made.shape == (50, 50)
+    assert np.count_nonzero(made == 255) == pytest.approx(20 * 40 / 16, rel=0.3)
+    assert made[0, 0] == 128
+
+
+def test_a_crop_at_the_border_is_unknown_beyond_it() -> None:
+    made = crop(np.zeros((TILE, TILE), np.uint8), (-10.0, -10.0, 10.0, 10.0), PRIM)
+    assert (made[:36, :36] == 128).all() and (made[36:, 36:] == 0).all()
+
+
+def test_tiles_cover_and_overlap() -> None:
+    frame = GridFrame(0.01, -260, -130, 520, 260)
+    found = list(tiles(frame))
+    covered = np.zeros(frame.shape, bool)
+    for tile in found:
+        covered[max(tile.row - frame.row, 0) :, max(tile.col - frame.col, 0) :][: tile.rows, : tile.cols] = True
+    assert covered.all()
+    rows = sorted({tile.row for tile in found})
+    assert max(np.diff(rows)) <= TILE - 64
+    single = next(tiles(GridFrame(0.01, -110, -110, 220, 220)))
+    assert (single.row, single.col) == (-112, -112)
+
+
+def test_a_tile_beyond_the_map_is_unknown() -> None:
+    grid = OccupancyGrid(GridFrame(0.01, 0, 0, 50, 60), np.ones((50, 60), np.float32))
+    image = cut(grid, GridFrame(0.01, -10, -10, TILE, TILE))
+    assert (image[10:60, 10:70, 0] == 255).all() and np.count_nonzero(image[..., 0] == 255) == 50 * 60
+    assert (image[:10, :, 0] == 128).all() and (image[:10, :, 2] == 0).all()
+
+
+def test_share_inside() -> None:
+    circle = Primitive(Kind.CIRCLE, 1.12, 0.0, None, (0.1,))
+    assert share_inside(circle, FRAME) == pytest.approx(0.5, abs=0.05)
+    assert math.isclose(share_inside(SHAPES[0], FRAME), 1.0)
+    assert World((2, 2), ()).bounds == (-1, -1, 1, 1)
