@@ -40,6 +40,8 @@ class DeterministicMapper:
             layer.cover(*end_extent(*rays))
         mark(layer.array, layer.frame.row, layer.frame.col, *rays)
 
+    keep = update
+
     def grid(self) -> OccupancyGrid:
         """The map so far: 0 free, 1 occupied, 0.5 unknown."""
         frame, states = self._layer.crop()

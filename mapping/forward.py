@@ -10,8 +10,9 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from dataclasses import dataclass
 
 import numpy as np
@@ -21,6 +22,7 @@ from mapping.calibration import occupancy
 from mapping.grid import UNKNOWN, GridFrame, Layer, OccupancyGrid
 from mapping.level import ALL, COLUMNS, Choice, Level, Noise, Rays, Totals, cells_within, evidence_of, smoothing_width
 from mapping.rays import end_extent
+from prim.errors import UsageError
 from prim.frames import Pose2D, Scan
 from prim.world import Bounds
 
@@ -52,6 +54,13 @@ HELD_OUT_RAYS = 1000
 
 SIEVE_SPREAD = 3.5
 """The sieve blurs the map, which takes about this many times its variance from the noise found (docs/forward.md)."""
+
+LEAST_GIVEN = 0.3
+"""Noise that is given counts as this many cells at least: a cell's centre is no nearer to the surface in it."""
+
+MOST_CELLS = 50_000_000
+NOISE_CELLS = 4_000_000
+"""The largest map, and the largest on which only the noise is looked for."""
 
 REVISITED = 256
 """While streaming, this many older rays are looked at again with each scan."""
@@ -104,21 +113,30 @@ class ForwardMapper:
         threads: int | None = None,
     ) -> None:
         self.resolution = resolution
+        if noise_std is not None and not 0 < noise_std < math.inf:
+            raise UsageError(f"the noise is {noise_std:g}: it must be above 0")
         self._layer = Layer(resolution, bounds, 0, np.uint8)
+        check_size(self._layer.frame)
         self._fixed = noise_std
         self._start = start_std
         self._rays = Rays()
-        workers = threads or len(os.sched_getaffinity(0))
-        self._pool = ThreadPoolExecutor(workers) if workers > 1 else None
+        self._threads = threads or cores()
         self._stream: Stream | None = None
         self._noise = Noise(noise_std or start_std or 10 * resolution)
+        self._learned = False
         self.history: list[tuple[int, Totals]] = []
 
     @property
-    def noise_std(self) -> float:
-        """The noise (m) that was given, or found so far: the sieve's share is added to what the fit sees."""
+    def noise_std(self) -> float | None:
+        """The noise (m) that was given, or found so far; None where too few rays were stopped to find it.
+
+        What the sieve takes from it is added to what the fit sees. Noise that is smaller than a cell cannot be told
+        from the cell: up to about 0.6 of its side is found where there is none.
+        """
         if self._fixed is not None:
             return self._fixed
+        if not self._learned:
+            return None
         width = smoothing_width(self._noise.std, self.resolution)
         share = SIEVE_SPREAD * width**2 if width >= 0.3 * self.resolution else 0.0
         return math.sqrt(self._noise.std**2 + share)
@@ -132,11 +150,13 @@ class ForwardMapper:
         """Adds one scan, taken by a laser at ``pose`` in the map frame."""
         if not self.keep(scan, pose):
             return
+        frame = self._stream_frame()
         if self._stream is None:
-            self._noise = Noise(self._fixed or self._first_guess())
-        if self._stream is None or self._stream.level.frame != self._stream_frame():
-            self._stream = Stream(self._stream_frame(), self._stream)
+            self._noise = self._first_noise(frame.resolution)
+        if self._stream is None or self._stream.level.frame != frame:
+            self._stream = Stream(frame, self._stream)
         self._noise = self._stream.take(self._rays, self._noise, self._fixed is not None)
+        self._learned = self._learned or self._stream.learned
 
     def keep(self, scan: Scan, pose: Pose2D) -> bool:
         """Keeps a scan for :meth:`finish` without looking at it now; whether it says anything."""
@@ -144,6 +164,7 @@ class ForwardMapper:
             place = (pose.x, pose.y, math.cos(pose.theta), math.sin(pose.theta))
             limits = (scan.range_min, scan.range_max)
             self._layer.cover(*end_extent(scan.ranges, scan.directions, place, limits, 1 / self.resolution))
+            check_size(self._layer.frame)
         return self._rays.add(scan, pose) > 0
 
     def grid(self) -> OccupancyGrid:
@@ -164,8 +185,9 @@ class ForwardMapper:
 
     def fit(self) -> Fit:
         """The fit itself, before it is turned into occupancy."""
-        level, self._noise = self._fit()
-        return self._read(level, self._noise)
+        with workers(self._threads) as pool:
+            level, self._noise = self._fit(pool)
+            return self._read(level, self._noise)
 
     def _frame(self) -> GridFrame:
         return self._layer.used or self._layer.frame
@@ -176,21 +198,25 @@ class ForwardMapper:
             factor *= 2
         return coarser(frame, factor)
 
-    def _first_guess(self) -> float:
-        """The noise to begin with: what neighbouring beams say, or more where so asked."""
-        return max(neighbour_noise(self._rays.rays[:, 2]) or 0.0, self._start or 0.0, self.resolution)
+    def _first_noise(self, resolution: float) -> Noise:
+        """The noise to begin with: as given (no less than the cells show), else what neighbouring beams say."""
+        if self._fixed is not None:
+            return Noise(max(self._fixed, LEAST_GIVEN * resolution))
+        return Noise(max(neighbour_noise(self._rays.rays[:, 2]) or 0.0, self._start or 0.0, self.resolution))
 
-    def _fit(self) -> tuple[Level, Noise]:
+    def _fit(self, pool: ThreadPoolExecutor | None) -> tuple[Level, Noise]:
         """From coarse to fine; then the noise from rays held out, and the map from all of them."""
         self.history.clear()
-        learns = self._fixed is None
-        noise = Noise(self._fixed or self._first_guess())
+        self._learned = False
+        learns, many = self._fixed is None, len(self._rays) > THIN_RAYS
         holds_out = learns and len(self._rays) >= HELD_OUT_RAYS
-        many = len(self._rays) > THIN_RAYS
         frame = self._frame()
+        noise = self._first_noise(self.resolution)
+        guess = neighbour_noise(self._rays.rays[:, 2]) or 0.0
         level: Level | None = None
         for factor in factors(noise.std / self.resolution):
-            finer = Level(coarser(frame, factor), START * factor, self._pool)
+            finer = Level(coarser(frame, factor), START * factor, pool)
+            noise = noise if learns else self._first_noise(finer.frame.resolution)
             finer.smooth(noise.std)
             if level is not None:
                 finer.start_from(level)
@@ -201,8 +227,10 @@ class ForwardMapper:
         assert level is not None
         if holds_out:
             noise = self._held_out_noise(level, noise)
-        if holds_out or many:
-            noise = self._climb(level, 1, ALL, noise, learns and not holds_out, LAST_PASSES)
+        elif learns:
+            noise = Noise(max(noise.std, guess), noise.wild)
+        if learns or many:
+            noise = self._climb(level, 1, ALL, noise, False, LAST_PASSES)
         level.free_all()
         return level, noise
 
@@ -212,7 +240,8 @@ class ForwardMapper:
         """Passes over one level until it has converged; a step that overshot is taken back, and made plain."""
         power, best = POWER, -math.inf
         kept: tuple[NDArray[np.float32], NDArray[np.float32], Totals, Noise] | None = None
-        for _ in range(most or PASSES[factor]):
+        passes = most or PASSES[factor]
+        for count in range(1, passes + 1):
             sums, totals = level.expect(self._rays, noise, choice)
             if kept is not None and totals.per_ray < best and power > 1:
                 parameters, sums, totals, noise = kept
@@ -224,9 +253,10 @@ class ForwardMapper:
                 self.history.append((factor, totals))
             best = totals.per_ray
             kept = level.parameters.copy(), sums, totals, noise
-            level.maximize(sums, power)
+            level.maximize(sums, power if count < passes else 1)
             if learns:
                 noise = totals.noise(noise, level.frame.resolution)
+                self._learned = totals.tell_noise
         return noise
 
     def _held_out_noise(self, level: Level, noise: Noise) -> Noise:
@@ -257,7 +287,8 @@ class Stream:
         self.level.blocks = 1
         self._sums = np.zeros((1, self.level.parameters.size, COLUMNS), np.float32)
         self._done = self._next = 0
-        if before is not None:
+        self.learned = False
+        if before is not None and before.level.frame.resolution == frame.resolution:  # else it begins anew
             self.level.adopt(before.level)
             self._done, self._next = before._done, before._next
             self._place(before)
@@ -295,6 +326,7 @@ class Stream:
         self._done = len(rays)
         if fixed or not found:
             return noise
+        self.learned = any(totals.tell_noise for totals in found)
         both = Totals(*(sum(values) for values in zip(*(_values(totals) for totals in found), strict=True)))
         return _between(noise, both.noise(noise, self.level.frame.resolution))
 
@@ -308,13 +340,44 @@ def _between(old: Noise, new: Noise) -> Noise:
     return Noise(math.sqrt(old.std * new.std), math.sqrt(old.wild * new.wild))
 
 
-def find_noise(scans: Iterable[tuple[Scan, Pose2D]], frame: GridFrame) -> float:
-    """The sensor's noise (m), found from scans and the poses of their laser, on a map of ``frame``."""
+def find_noise(scans: Iterable[tuple[Scan, Pose2D]], frame: GridFrame) -> float | None:
+    """The sensor's noise (m), found from scans and the poses of their laser on a map of ``frame``; None if it cannot.
+
+    A map of more than NOISE_CELLS is made of larger cells.
+    """
+    factor = 1
+    while frame.rows * frame.cols > NOISE_CELLS * factor**2:
+        factor *= 2
+    frame = coarser(frame, factor)
     mapper = ForwardMapper(frame.resolution, frame.bounds)
     for scan, pose in scans:
         mapper.keep(scan, pose)
     mapper.fit()
     return mapper.noise_std
+
+
+def check_size(frame: GridFrame) -> None:
+    """Raises UsageError for a map that would not fit the memory: the fit takes some 80 bytes for each cell."""
+    if frame.rows * frame.cols > MOST_CELLS:
+        raise UsageError(
+            f"a map of {frame.rows * frame.cols / 1e6:.0f} million cells is too large for --mapper forward "
+            f"(at most {MOST_CELLS / 1e6:.0f} million): give a coarser --resolution or smaller --bounds"
+        )
+
+
+def cores() -> int:
+    """How many cores this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+@contextmanager
+def workers(threads: int) -> Iterator[ThreadPoolExecutor | None]:
+    """A pool of threads for the time being; none where one is enough."""
+    if threads == 1:
+        yield None
+        return
+    with ThreadPoolExecutor(threads) as pool:
+        yield pool
 
 
 def coarser(frame: GridFrame, factor: int) -> GridFrame:

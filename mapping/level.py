@@ -89,9 +89,14 @@ class Totals:
         """The mean log-likelihood of a ray."""
         return self.log_likelihood / self.rays if self.rays else 0.0
 
+    @property
+    def tell_noise(self) -> bool:
+        """Whether enough rays were stopped to learn the noise from them."""
+        return self.stops >= LEAST_STOPS
+
     def noise(self, before: Noise, resolution: float) -> Noise:
         """The M step of the noise."""
-        if self.stops < LEAST_STOPS:
+        if not self.tell_noise:
             return before
         std = before.std * math.sqrt(self.squares / self.stops)
         wild = min(max(self.wild / self.rays, LEAST_WILD), MOST_WILD)

@@ -38,7 +38,10 @@ CHUNK = 32
 """So many cells are walked before it is asked whether a ray is spent."""
 
 HOLD_OUT = 5
-"""Every so manyth ray is held out where the noise is to be found from rays that the map has not seen."""
+"""Every so manyth ray is held out where the noise is to be found from rays that the map has not seen.
+
+Which ones moves on from scan to scan: they are not the same bearings each time.
+"""
 
 NEVER_NOTHING = 1e-10
 """What is left of a ray stays above this: numbers near the smallest ones would slow the processor down a lot."""
@@ -275,6 +278,22 @@ def scatter(count: int, behind: Any, share: Any, where: Any, sums: Any, certain:
             sums[c, CERTAIN] += behind * behind
 
 
+@inline
+def measured(z: float, z_min: float, z_max: float, spread: float) -> tuple[int, float, float]:
+    """What was measured: its kind, the range that it tells of, and how far the ray can have come at most."""
+    if z == -math.inf:
+        return TOO_NEAR, z_min, z_min + REACH * spread
+    if z >= z_max:
+        return NO_RETURN, z_max, z_max
+    return MEASURED, z, z + REACH * spread
+
+
+@inline
+def is_chosen(number: Any, stride: int, held_out: int) -> bool:
+    """Whether a pass takes a ray: every ``stride``-th, of those held out (-1), of the others (1), or of all (0)."""
+    return number % stride == 0 and (held_out == 0 or (number % HOLD_OUT == 0) == (held_out < 0))
+
+
 @kernel
 def expect(
     scans: Any,
@@ -317,11 +336,11 @@ def expect(
     per_metre, spread = 1 / resolution, sigma / resolution
     inverse_spread = 1 / spread
     scan = np.searchsorted(first_rays, begin, side="right") - 1
-    for i in range(begin, end, stride):
-        if held_out != 0 and (i % HOLD_OUT == 0) != (held_out < 0):
-            continue
+    for i in range(begin, end):
         while i >= first_rays[scan + 1]:
             scan += 1
+        if not is_chosen(i + scan, stride, held_out):
+            continue
         x, y = (scans[scan, 0] - corner[0]) * per_metre, (scans[scan, 1] - corner[1]) * per_metre
         z_min, z_max = scans[scan, 2] * per_metre, scans[scan, 3] * per_metre
         z = float(rays[i, 2]) * per_metre
@@ -332,11 +351,9 @@ def expect(
         )
         if first > last:
             continue
-        kind, furthest = MEASURED, z + REACH * spread
-        if z == -math.inf:
-            kind, z, furthest = TOO_NEAR, z_min, z_min + REACH * spread
-        elif z >= z_max:
-            kind, z, furthest = NO_RETURN, z_max, z_max
+        kind, z, furthest = measured(z, z_min, z_max, spread)
+        if furthest < s0 + (first - 0.5) * ds:  # it ended before the grid begins
+            continue
         exit_at = s0 + (last + 0.5) * ds
         leaves = exit_at <= furthest
         stop = last if leaves else min(last, int((furthest - s0) / ds))

@@ -28,6 +28,9 @@ class Mapper(Protocol):
     def update(self, scan: Scan, pose: Pose2D) -> None:
         """Adds one scan, taken by a laser at ``pose`` in the map frame."""
 
+    def keep(self, scan: Scan, pose: Pose2D) -> object:
+        """As :meth:`update`, where nobody looks at the map before it is finished."""
+
     def grid(self) -> OccupancyGrid:
         """The map so far; later updates do not change it."""
 
@@ -70,7 +73,10 @@ def make_mapper(
     check_mapper(name, sensor_model, noise_std)
     if sensor_model == "gaussian" and noise_std is None:
         raise UsageError("the Gaussian sensor model needs --noise-std")
-    _make(name, 1.0, (0.0, 0.0, 1.0, 1.0), noise_std).update(_NO_RAYS, Pose2D())
+    trial = _make(name, 0.5, (-1.0, -1.0, 1.0, 1.0), noise_std)
+    trial.update(_FEW_RAYS, Pose2D(0.1, 0.1))
+    trial.grid()
+    trial.finish()
     return _make(name, resolution, bounds, noise_std)
 
 
@@ -82,4 +88,4 @@ def _make(name: str, resolution: float, bounds: Bounds | None, noise_std: float 
     return DeterministicMapper(resolution, bounds)
 
 
-_NO_RAYS = Scan(0, "", 0.0, 0.0, 0.0, 1.0, np.zeros(0, dtype=np.float32))
+_FEW_RAYS = Scan(0, "", 0.0, 2.0, 0.1, 1.0, np.array([0.7, -np.inf, np.inf], dtype=np.float32))

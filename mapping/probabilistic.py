@@ -99,6 +99,8 @@ class ProbabilisticMapper:
             layer.cover(*end_extent(*rays))
         add_log_odds(layer.array, layer.frame.row, layer.frame.col, *rays, self._reach, self._table, self._spacing)
 
+    keep = update
+
     def grid(self) -> OccupancyGrid:
         """The map so far."""
         frame, odds = self._layer.crop()

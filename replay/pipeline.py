@@ -261,6 +261,12 @@ class Pipeline:
             some = [(scan, pose) for position, scan, pose in self._posed(scans, poses) if position % every == 0]
             with self._clock.stage("map"):
                 noise_std = find_noise(some, frame)
+            if noise_std is None:
+                raise LogReadError(
+                    self.path,
+                    "too few ranges to find the noise for the Gaussian sensor model",
+                    "give it: --noise-std",
+                )
         return make_mapper(options.mapper, options.resolution, frame.bounds, options.sensor_model, noise_std)
 
     def _posed(self, scans: ScanLog, poses: LaserPoses) -> Iterator[tuple[int, Scan, Pose2D]]:
@@ -325,12 +331,13 @@ class Pipeline:
         used = Used()
         shown: World | None = None
         pace = Pace(self.options.rate)
+        add = mapper.update if map_every else mapper.keep
         for position, scan, pose in self._posed(scans, poses):
             stamp = int(scans.stamps[position])
             pace.wait(stamp)
             start = time.perf_counter()
             with self._clock.stage("map"):
-                mapper.update(scan, pose)
+                add(scan, pose)
             seconds = time.perf_counter() - start
             judge.update(position, scan, stamp)
             used.count(scan)

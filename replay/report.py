@@ -18,6 +18,9 @@ from replay.pipeline import ReplayResult
 
 SCHEMA = "prim-replay/1"
 
+CELLS_LIMIT = 1.5
+"""Noise below this many cells cannot be told from the cells' own size."""
+
 FREE_THRESHOLD, OCCUPIED_THRESHOLD = 0.196, 0.65
 """nav2's map_server calls cells below the one free and above the other occupied; 205 is 0.19608, unknown."""
 
@@ -131,7 +134,7 @@ def table(result: ReplayResult) -> list[tuple[str, str]]:
         ("bounds", f"x {x0:.2f} to {x1:.2f} m, y {y0:.2f} to {y1:.2f} m"),
     ]
     if result.noise_std is not None:
-        rows.append(("range noise", f"{result.noise_std * 1000:.1f} mm (standard deviation)"))
+        rows.append(("range noise", _noise(result.noise_std, result.options.noise_std is not None, frame.resolution)))
     if result.pose_rmse is not None:
         metres, radians = result.pose_rmse
         rows.append(("pose error", f"{metres * 1000:.1f} mm, {np.degrees(radians):.2f} deg (RMS)"))
@@ -145,6 +148,15 @@ def table(result: ReplayResult) -> list[tuple[str, str]]:
     rate = result.rays / seconds["map"] / 1e6 if seconds["map"] else 0.0
     rows.append(("time", f"{seconds['total']:.2f} s, mapping {seconds['map']:.3f} s ({rate:.2f} M rays/s)"))
     return rows
+
+
+def _noise(std: float, given: bool, resolution: float) -> str:
+    """The noise in words: what is found of noise that is no larger than a cell is mostly the cell."""
+    if given:
+        return f"{std * 1000:.1f} mm (as given)"
+    if std < CELLS_LIMIT * resolution:
+        return f"at most {std * 1000:.1f} mm (cells of {resolution * 1000:g} mm show no less)"
+    return f"{std * 1000:.1f} mm (standard deviation)"
 
 
 def _percent(share: float | None) -> str:

@@ -70,6 +70,10 @@ def expect(
         if not cells:
             continue
         near, none = z == -math.inf, z >= z_max
+        furthest = z_max if none else (z_min if near else z) + 6 * sigma
+        half = 0.5 / max(abs(math.cos(angle)), abs(math.sin(angle)))
+        if furthest < cells[0][2] - half:  # it ended before the grid begins
+            continue
         left, parts, squares = 1.0, [], []
         for row, col, s in cells:
             if none and s > z_max:

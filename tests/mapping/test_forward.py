@@ -15,6 +15,7 @@ from mapping.calibration import known
 from mapping.forward import ForwardMapper, coarser, find_noise
 from mapping.grid import GridFrame
 from mapping.level import ALL, Choice, Level, Noise, Rays
+from prim.errors import UsageError
 from prim.frames import Pose2D, Scan
 from prim.metrics import map_scores
 from recorder.sensors import Lidar
@@ -282,6 +283,51 @@ def test_a_few_wild_ranges_leave_no_mark() -> None:
     assert (np.hypot(*inside.T) > 0.85).all()
     assert mapper.wild_share == pytest.approx(7 / 360, rel=0.4)
     assert mapper.noise_std < 0.03
+
+
+def test_a_map_that_grows_is_the_one_with_bounds() -> None:
+    """While it streams, its cells become coarser as it grows; at the end it is the same map."""
+    rooms = [np.full(200, size) for size in (1.0, 1.5, 3.0, 6.0)]
+    growing, bounded = ForwardMapper(0.02), ForwardMapper(0.02, (-7, -7, 7, 7))
+    for room in rooms:
+        for scan, pose in box_scans(room, 4):
+            growing.update(scan, pose)
+            bounded.keep(scan, pose)
+            assert growing.grid().probability.shape == growing.grid().frame.shape
+    small, large = growing.finish(), bounded.finish()
+    apart = np.abs(large.probability[large.frame.window(small.frame)] - small.probability)
+    assert np.mean(apart < 0.2) > 0.9999  # but for a few cells at the border
+
+
+def test_noise_is_not_told_where_nothing_was_hit(noisiest: Session) -> None:
+    far = ForwardMapper(0.05, (500, 500, 505, 505))
+    for scan, pose in noisiest.scans[:10]:
+        far.update(scan, pose)
+    far.finish()
+    assert far.noise_std is None and ForwardMapper(0.05).noise_std is None
+
+
+def test_noise_that_is_given_far_too_small_leaves_a_map() -> None:
+    session = session_of(0.02)
+    mapper = mapper_of(session, noise_std=1e-6)
+    assert session.truth is not None
+    scores = session.truth.score(mapper.finish().probability)
+    assert scores.occupied_f1 is not None and scores.occupied_f1 > 0.9
+    with pytest.raises(UsageError):
+        ForwardMapper(0.01, noise_std=0.0)
+
+
+def test_rays_that_end_before_the_grid_say_nothing() -> None:
+    mapper = ForwardMapper(0.02, (2, -0.5, 3, 0.5))
+    for scan, pose in box_scans(np.full(360, 1.0), 10):
+        mapper.keep(scan, pose)
+    assert (mapper.finish().probability == 0.5).all()
+    assert mapper.wild_share < 0.01
+
+
+def test_a_map_too_large_for_the_memory() -> None:
+    with pytest.raises(UsageError, match="million cells"):
+        ForwardMapper(0.001, (-5, -5, 5, 5))
 
 
 def test_held_out_rays_are_every_fifth() -> None:
