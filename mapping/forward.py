@@ -35,11 +35,14 @@ TOLERANCE, COARSE_TOLERANCE = 5e-4, 2e-3
 COARSEST = 8
 """The largest factor between the first level's cells and the map's."""
 
-PASSES = {1: 12, 2: 10, 4: 16, 8: 16}
+PASSES = {1: 6, 2: 10, 4: 16, 8: 16}
 """At most so many passes on the level whose cells are larger by a factor."""
 
 POWER = 3
 """How often a pass multiplies the odds of a cell by their ratio: over-relaxation, taken back where it overshoots."""
+
+MOST_START = 2.0
+"""The fit begins with no less noise than neighbouring beams show, and with no more than this many times as much."""
 
 THIN_RAYS = 20_000
 THIN_STRIDE, HALF_STRIDE = 4, 2
@@ -94,8 +97,8 @@ class Fit:
 class ForwardMapper:
     """Fits the chance of every cell to stop a ray, and the sensor's noise, to all rays together.
 
-    ``noise_std`` (m) fixes the noise; else it is found from the rays, whatever ``start_std`` it begins with (by
-    default a guess from neighbouring beams). Bounds as in :class:`mapping.deterministic.DeterministicMapper`.
+    ``noise_std`` (m) fixes the noise; else it is found from the rays, whatever ``start_std`` it is told to begin with
+    (by default what neighbouring beams show). Bounds as in :class:`mapping.deterministic.DeterministicMapper`.
     ``threads`` work side by side (by default one for each core) and give the same bits in any number.
 
     While scans stream in, a coarser map is kept up to date with a bounded amount of work for each; ``grid()`` is
@@ -202,7 +205,8 @@ class ForwardMapper:
         """The noise to begin with: as given (no less than the cells show), else what neighbouring beams say."""
         if self._fixed is not None:
             return Noise(max(self._fixed, LEAST_GIVEN * resolution))
-        return Noise(max(neighbour_noise(self._rays.rays[:, 2]) or 0.0, self._start or 0.0, self.resolution))
+        guess = max(neighbour_noise(self._rays.rays[:, 2]) or 0.0, self.resolution)
+        return Noise(min(max(self._start or guess, guess), MOST_START * guess))
 
     def _fit(self, pool: ThreadPoolExecutor | None) -> tuple[Level, Noise]:
         """From coarse to fine; then the noise from rays held out, and the map from all of them."""

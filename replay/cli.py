@@ -6,8 +6,8 @@ import dataclasses
 import math
 import sys
 import time
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager, suppress
+from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from enum import StrEnum
 from itertools import takewhile
@@ -21,7 +21,7 @@ from prim.errors import PrimError, UsageError
 
 if TYPE_CHECKING:
     from prim.world import Bounds
-    from replay.pipeline import Progress, ReplayOptions, ReplayResult
+    from replay.pipeline import ReplayOptions, ReplayResult
     from replay.show import Viewer, ViewerOptions
 
 PARTLY_LOST = 3
@@ -222,7 +222,7 @@ def _replay_log(log: Path, options: ReplayOptions, outputs: Outputs, shown: View
     for path in outputs.files:
         check_writable(path)
     viewer = _make_viewer(shown)
-    with _progress_bar(talk.quiet) as progress:
+    with console.progress_bar("scans", talk.quiet) as progress:
         result = Pipeline(log, options, viewer, progress).run()
     if outputs.report:
         write_report(outputs.report, result)
@@ -243,21 +243,6 @@ def _make_viewer(shown: ViewerOptions | None) -> Viewer | None:
     from replay.viewer import RerunViewer
 
     return RerunViewer(shown, announce=lambda line: typer.echo(line, err=True))
-
-
-@contextmanager
-def _progress_bar(quiet: bool) -> Iterator[Progress | None]:
-    """A bar on the terminal while scans are replayed; none where nobody looks."""
-    if quiet or not sys.stderr.isatty():
-        yield None
-        return
-    from rich.console import Console
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
-
-    columns = (TextColumn("scans"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-    with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
-        task = bar.add_task("scans", total=None)
-        yield lambda done, total: bar.update(task, completed=done, total=total)
 
 
 def _print_result(result: ReplayResult, outputs: Outputs, verbose: bool) -> None:

@@ -1,0 +1,183 @@
+"""prim-train: the command line of training."""
+
+from __future__ import annotations
+
+import dataclasses
+import sys
+from collections.abc import Sequence
+from enum import StrEnum
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from prim import __version__, console
+from prim.errors import UsageError
+
+train = typer.Typer(add_completion=False, rich_markup_mode=None, no_args_is_help=True)
+
+
+class MapperName(StrEnum):
+    """The mappers."""
+
+    DET = "det"
+    PROB = "prob"
+    FORWARD = "forward"
+
+
+class KindName(StrEnum):
+    """The kinds of primitives, and all of them."""
+
+    ALL = "all"
+    SQUARE = "square"
+    RECTANGLE = "rectangle"
+    CIRCLE = "circle"
+    TRIANGLE = "triangle"
+    ELLIPSE = "ellipse"
+
+
+class SetName(StrEnum):
+    """The presets of sets."""
+
+    PAPER = "paper"
+    MIXED = "mixed"
+
+
+class PresetName(StrEnum):
+    """The presets of training."""
+
+    PRIM = "prim"
+    PAPER = "paper"
+
+
+def _show_version(wanted: bool) -> None:
+    if wanted:
+        typer.echo(f"prim-train {__version__}")
+        raise typer.Exit
+
+
+@train.callback()
+def _main(
+    version: Annotated[
+        bool, typer.Option("--version", callback=_show_version, is_eager=True, help="Print the version.")
+    ] = False,
+) -> None:
+    """Make training sets and train the detector's networks on them."""
+
+
+@train.command()
+def dataset(
+    folder: Annotated[Path, typer.Argument(metavar="FOLDER", help="Where the set is made, or gone on with.")],
+    preset: Annotated[SetName, typer.Option(help="What it holds, where no other option says.")] = SetName.PAPER,
+    maps: Annotated[
+        tuple[int, int] | None, typer.Option(metavar="TRAIN VAL", help="Sessions to train on and to validate on.")
+    ] = None,
+    noise_std: Annotated[list[float] | None, typer.Option(metavar="M", help="Range noise, metres; repeat.")] = None,
+    mapper: Annotated[list[MapperName] | None, typer.Option(help="A mapper; repeat. [default: all]")] = None,
+    kind: Annotated[list[KindName] | None, typer.Option(help="A kind of primitive; repeat. [default: all]")] = None,
+    seed: Annotated[int | None, typer.Option(metavar="N", help="The first session's seed.")] = None,
+    workers: Annotated[int | None, typer.Option(metavar="N", help="Processes. [default: one a core]")] = None,
+    quiet: Annotated[bool, typer.Option("--quiet", help="Print errors only.")] = False,
+    debug: Annotated[bool, typer.Option("--debug", help="Show tracebacks.")] = False,
+) -> int:
+    """Record sessions, map them with every mapper, and keep images, labels and exact primitives.
+
+    A set that was interrupted goes on where it stopped; the same options make the same set.
+    """
+    from detect.dataset import PRESETS, make
+
+    given: dict[str, Any] = {
+        "sizes": maps,
+        "noise_stds": tuple(noise_std) if noise_std else None,
+        "mappers": tuple(name.value for name in mapper) if mapper else None,
+        "kinds": tuple(name.value for name in kinds_of(kind)) if kind else None,
+        "seed": seed,
+    }
+    options = dataclasses.replace(
+        PRESETS[preset.value], **{name: value for name, value in given.items() if value is not None}
+    )
+    with console.progress_bar("sessions", quiet) as progress:
+        made = make(folder, options, progress, workers)
+    if not quiet:
+        typer.echo(
+            f"made {made} of {sum(options.sizes)} sessions in {folder} ({sum(options.sizes) - made} were there)"
+        )
+    return 0
+
+
+@train.command()
+def cnn(
+    data: Annotated[Path, typer.Argument(metavar="SET", help="A set made by prim-train dataset.")],
+    output: Annotated[Path, typer.Argument(metavar="FOLDER", help="Where checkpoints go: cnn.MAPPER.KIND.pt.")],
+    mapper: Annotated[MapperName, typer.Option(help="Whose maps to learn from.")] = MapperName.FORWARD,
+    kind: Annotated[KindName, typer.Option(help="Whose network to train.")] = KindName.ALL,
+    preset: Annotated[PresetName, typer.Option(help="Ours, or the paper's settings.")] = PresetName.PRIM,
+    epochs: Annotated[
+        int | None, typer.Option(metavar="N", help="Passes over the set. [default: the preset's]")
+    ] = None,
+    seed: Annotated[int, typer.Option(metavar="N", help="What the weights begin from.")] = 0,
+    quiet: Annotated[bool, typer.Option("--quiet", help="Print errors only.")] = False,
+    debug: Annotated[bool, typer.Option("--debug", help="Show tracebacks.")] = False,
+) -> int:
+    """Train the networks that read a primitive's parameters from a crop. An interrupted run goes on."""
+    need_extra()
+    from detect.train import CNN_PRESETS, train_cnn
+    from prim.shapes import Kind
+
+    options = dataclasses.replace(CNN_PRESETS[preset.value], seed=seed)
+    if epochs is not None:
+        options = dataclasses.replace(options, epochs=epochs)
+    output.mkdir(parents=True, exist_ok=True)
+    for name in kinds_of([kind]):
+
+        def tell(done: int, total: int, loss: float, validation: float, name: KindName = name) -> None:
+            if not quiet:
+                typer.echo(f"{name.value}: epoch {done} of {total}, loss {loss:.5f}, validation {validation:.5f}")
+
+        path = output / f"cnn.{mapper.value}.{name.value}.pt"
+        train_cnn(data, mapper.value, Kind(name.value), path, options, tell)
+    return 0
+
+
+@train.command()
+def yolo(
+    data: Annotated[Path, typer.Argument(metavar="SET", help="A set made by prim-train dataset.")],
+    output: Annotated[Path, typer.Argument(metavar="FOLDER", help="Where ultralytics leaves its run.")],
+    mapper: Annotated[MapperName, typer.Option(help="Whose maps to learn from.")] = MapperName.FORWARD,
+    preset: Annotated[PresetName, typer.Option(help="Ours, or the paper's settings.")] = PresetName.PRIM,
+    epochs: Annotated[
+        int | None, typer.Option(metavar="N", help="Passes over the set. [default: the preset's]")
+    ] = None,
+    start: Annotated[Path | None, typer.Option(metavar="W.pt", help="Weights to begin from.")] = None,
+    trust: Annotated[bool, typer.Option("--trust", help="A .pt is a pickle that can run code: run it.")] = False,
+    seed: Annotated[int, typer.Option(metavar="N", help="What the weights begin from.")] = 0,
+    debug: Annotated[bool, typer.Option("--debug", help="Show tracebacks.")] = False,
+) -> int:
+    """Train YOLOv5 to find the primitives. An interrupted run goes on."""
+    need_extra()
+    from detect.train import YOLO_PRESETS, train_yolo
+
+    options = dataclasses.replace(YOLO_PRESETS[preset.value], seed=seed, start=start, trust=trust)
+    if epochs is not None:
+        options = dataclasses.replace(options, epochs=epochs)
+    best = train_yolo(data, mapper.value, output, options)
+    typer.echo(f"wrote: {best}")
+    return 0
+
+
+def need_extra() -> None:
+    """Raises UsageError where torch and ultralytics are not installed."""
+    missing = [name for name in ("torch", "ultralytics") if find_spec(name) is None]
+    if missing:
+        raise UsageError(f"training needs {' and '.join(missing)}: pip install 'prim[train]'")
+
+
+def kinds_of(names: Sequence[KindName]) -> list[KindName]:
+    """The kinds named; all of them where one name is ``all``."""
+    return [name for name in KindName if name is not KindName.ALL and (name in names or KindName.ALL in names)]
+
+
+def main() -> None:
+    """The entry point."""
+    sys.exit(console.run(train, "prim-train", sys.argv[1:]))

@@ -1,0 +1,72 @@
+"""prim-train, as it is called."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from detect import cli
+from prim import console
+
+Run = Callable[..., tuple[int, str, str]]
+
+
+@pytest.fixture
+def run(in_tmp: Path, capsys: pytest.CaptureFixture[str]) -> Run:
+    """Runs prim-train in a folder of its own; exit code, stdout, stderr."""
+
+    def call(*arguments: object) -> tuple[int, str, str]:
+        code = console.run(cli.train, "prim-train", [str(argument) for argument in arguments])
+        seen = capsys.readouterr()
+        return code, seen.out, seen.err
+
+    return call
+
+
+def test_a_set_is_made_and_gone_on_with(run: Run) -> None:
+    options = ("--maps", 1, 1, "--noise-std", 0.1, "--mapper", "det", "--kind", "circle", "--seed", 5)
+    code, out, err = run("dataset", "set", *options)
+    assert (code, err) == (0, "") and out.startswith("made 2 of 2 sessions in set")
+    assert run("dataset", "set", *options)[1].startswith("made 0 of 2")
+    code, _, err = run("dataset", "set", *options[:-1], 6)
+    assert code == 2 and "other options" in err and err.count("\n") == 1
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (["dataset", "a", "--maps", "0", "0"], "at least one session"),
+        (["dataset", "a", "--mapper", "magic"], "--mapper"),
+        (["magic"], "magic"),
+    ],
+)
+def test_impossible_options(run: Run, arguments: list[str], said: str) -> None:
+    code, _, err = run(*arguments)
+    assert code == 2 and said in err and err.count("\n") == 1
+
+
+@pytest.mark.parametrize("command", ["yolo", "cnn"])
+def test_without_torch_the_extra_is_named(run: Run, monkeypatch: pytest.MonkeyPatch, command: str) -> None:
+    monkeypatch.setattr(cli, "find_spec", lambda name: None)
+    code, _, err = run(command, "set", "out")
+    assert code == 2 and "pip install 'prim[train]'" in err and err.count("\n") == 1
+
+
+def test_weights_that_can_run_code_must_be_trusted(run: Run) -> None:
+    pytest.importorskip("torch", reason="needs the extra [train]")
+    code, _, err = run("yolo", "set", "out", "--start", "a.pt")
+    assert code == 2 and "--trust" in err
+
+
+def test_a_network_learns_and_goes_on(run: Run) -> None:
+    pytest.importorskip("torch", reason="needs the extra [train]")
+    run("dataset", "set", "--maps", 6, 2, "--mapper", "prob", "--kind", "circle", "--noise-std", 0.0)
+    code, out, _ = run("cnn", "set", "out", "--mapper", "prob", "--kind", "circle", "--epochs", 4)
+    losses = [float(line.split("loss ")[1].split(",")[0]) for line in out.splitlines()]
+    assert code == 0 and len(losses) == 4 and losses[-1] < losses[0]
+    assert (Path("out") / "cnn.prob.circle.pt").exists()
+    assert run("cnn", "set", "out", "--mapper", "prob", "--kind", "circle", "--epochs", 4)[1] == ""
+    code, _, err = run("cnn", "set", "out", "--mapper", "prob", "--kind", "circle", "--epochs", 5)
+    assert code == 2 and "other options" in err
