@@ -337,7 +337,7 @@ def _as_grid_map(grid: OccupancyGrid, values: NDArray[np.uint8], colormap: Any) 
 
 
 def _evidence_map(grid: OccupancyGrid) -> rr.GridMap:
-    """How many rays came to each cell, as grey on a logarithmic scale: black for none."""
+    """How many rays came to each cell, on a logarithmic scale."""
     return _as_grid_map(grid, grid.image()[..., 1], None)
 
 
