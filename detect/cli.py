@@ -166,6 +166,35 @@ def yolo(
     return 0
 
 
+class StageName(StrEnum):
+    """The stages of detection."""
+
+    YOLO = "yolo"
+    CNN = "cnn"
+
+
+@train.command()
+def export(
+    weights: Annotated[Path, typer.Argument(metavar="W.pt", help="What prim-train yolo or prim-train cnn has left.")],
+    output: Annotated[Path, typer.Argument(metavar="OUT.onnx", help="The file to make.")],
+    stage: Annotated[StageName, typer.Option(help="What the weights are of.")],
+    mapper: Annotated[MapperName, typer.Option(help="Whose maps they were trained on.")] = MapperName.FORWARD,
+    image_size: Annotated[int, typer.Option(metavar="PX", help="The side of YOLO's images.")] = 224,
+    trust: Annotated[bool, typer.Option("--trust", help="YOLO's .pt is a pickle that can run code: run it.")] = False,
+    debug: Annotated[bool, typer.Option("--debug", help="Show tracebacks.")] = False,
+) -> int:
+    """Make an ONNX file with a model card of trained weights."""
+    need_extra()
+    from detect.export import export_cnn, export_yolo
+
+    if stage is StageName.CNN:
+        export_cnn(weights, mapper.value, output)
+    else:
+        export_yolo(weights, mapper.value, output, image_size, trust)
+    typer.echo(f"wrote: {output}")
+    return 0
+
+
 def need_extra() -> None:
     """Raises UsageError where torch and ultralytics are not installed."""
     missing = [name for name in ("torch", "ultralytics") if find_spec(name) is None]

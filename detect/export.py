@@ -1,0 +1,90 @@
+"""Trained networks as ONNX files with a model card. Needs the extra ``[train]``."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import tempfile
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from detect.networks import ParameterNetwork
+from detect.parameters import PRESETS
+from detect.weights import CARD_KEY, Card
+from prim.errors import UsageError
+from prim.shapes import Kind
+
+OPSET = 17
+
+
+def export_cnn(checkpoint: Path, mapper: str, output: Path, about: Mapping[str, Any] | None = None) -> Card:
+    """Makes an ONNX file of a checkpoint of ``prim-train cnn``; crops (N, channels, pixels, pixels), outputs (N, M).
+
+    Raises UsageError on a file that is no such checkpoint; nothing in it is run.
+    """
+    network = _read_checkpoint(checkpoint)
+    network.eval()
+    pixels = network.preset.pixels
+    card = Card("cnn", mapper, network.kind.value, network.preset.name, network.channels, dict(about or {}))
+    torch.onnx.export(
+        network,
+        (torch.zeros(2, network.channels, pixels, pixels),),
+        str(output),
+        input_names=["crops"],
+        output_names=["outputs"],
+        dynamic_axes={"crops": {0: "n"}, "outputs": {0: "n"}},
+        opset_version=OPSET,
+        dynamo=False,
+    )
+    write_card(output, card)
+    return card
+
+
+def _read_checkpoint(path: Path) -> ParameterNetwork:
+    try:
+        state = torch.load(path, weights_only=True)
+        options = state["options"]
+        network = ParameterNetwork(Kind(state["kind"]), PRESETS[options["preset"]], options["channels"])
+        network.load_state_dict(state["network"])
+    except Exception as error:  # torch raises many kinds on files that are none of its own
+        raise UsageError(f"{path} is no checkpoint of prim-train cnn") from error
+    return network
+
+
+def export_yolo(
+    weights: Path, mapper: str, output: Path, image_size: int, trust: bool, about: Mapping[str, Any] | None = None
+) -> Card:
+    """Makes an ONNX file of YOLO weights: images (N, 3, rows, cols), boxes and scores (N, 4 + kinds, anchors).
+
+    The weights are a pickle, which can run code when it is read: raises UsageError unless told to ``trust`` them.
+    """
+    if not trust:
+        raise UsageError(f"{weights} is a pickle, which can run code: add --trust if you know where it is from")
+    if not weights.is_file():
+        raise UsageError(f"{weights} is not there")
+    os.environ["YOLO_AUTOINSTALL"] = "false"
+    from ultralytics import YOLO
+
+    with tempfile.TemporaryDirectory() as folder:
+        copy = Path(folder) / weights.name
+        shutil.copy(weights, copy)
+        made = YOLO(str(copy)).export(format="onnx", imgsz=image_size, dynamic=True, opset=OPSET, verbose=False)
+        shutil.move(made, output)
+    card = Card("yolo", mapper, None, None, 3, {"image_size": image_size} | dict(about or {}))
+    write_card(output, card)
+    return card
+
+
+def write_card(path: Path, card: Card) -> None:
+    """Puts a card into an ONNX file's metadata."""
+    import onnx
+
+    model = onnx.load(str(path))
+    for entry in list(model.metadata_props):
+        if entry.key == CARD_KEY:
+            model.metadata_props.remove(entry)
+    model.metadata_props.add(key=CARD_KEY, value=card.to_json())
+    onnx.save(model, str(path))

@@ -1,0 +1,93 @@
+"""Networks as files: ONNX with a model card, run by ONNX Runtime. No such file can run code."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from prim.errors import PrimError
+
+if TYPE_CHECKING:
+    import onnxruntime
+
+SCHEMA = "prim-weights/1"
+CARD_KEY = "prim"
+"""The card's key in the file's metadata."""
+
+PICKLES = (b"\x80", b"PK")
+"""How a pickle begins, bare or in torch's archive."""
+
+
+class WeightsError(PrimError):
+    """A weights file that cannot be used: what is wrong with it, and what to do."""
+
+
+@dataclass(frozen=True)
+class Card:
+    """What a network is for: the ``stage`` (yolo or cnn), whose maps it reads, and what is known of its making."""
+
+    stage: str
+    mapper: str
+    kind: str | None = None
+    preset: str | None = None
+    channels: int = 3
+    about: Mapping[str, Any] = field(default_factory=dict)
+
+    def to_json(self) -> str:
+        """As it stands in the file."""
+        return json.dumps({"schema": SCHEMA} | vars(self))
+
+    @classmethod
+    def from_json(cls, text: str) -> Card:
+        """Reads a card. Raises ValueError on one that is none."""
+        value = json.loads(text)
+        if not isinstance(value, dict) or value.pop("schema", None) != SCHEMA:
+            raise ValueError(f"no {SCHEMA}")
+        try:
+            return cls(**value)
+        except TypeError as error:
+            raise ValueError(str(error)) from error
+
+
+@dataclass(frozen=True)
+class Weights:
+    """A network that is ready to run, and its card."""
+
+    path: Path
+    card: Card
+    session: onnxruntime.InferenceSession
+
+
+def load_weights(path: Path, stage: str, mapper: str | None = None, threads: int = 0) -> Weights:
+    """Opens a network of a ``stage``, for the maps of ``mapper`` where one is named.
+
+    Raises WeightsError on a file that is missing, corrupt, a pickle, without a card, or for something else.
+    """
+    import onnxruntime
+
+    try:
+        content = path.read_bytes()
+    except OSError as error:
+        raise WeightsError(f"{path}: {error.strerror or error}") from error
+    if content.startswith(PICKLES):
+        raise WeightsError(f"{path} is a pickle, which can run code: make an ONNX file of it with prim-train export")
+    options = onnxruntime.SessionOptions()
+    options.intra_op_num_threads = threads
+    options.log_severity_level = 4
+    try:
+        session = onnxruntime.InferenceSession(content, options, providers=["CPUExecutionProvider"])
+    except Exception as error:  # ONNX Runtime raises many kinds, none of them documented
+        what = f"{path} is no ONNX network, or a damaged one"
+        raise WeightsError(f"{what}: make it anew with prim-train export") from error
+    try:
+        card = Card.from_json(session.get_modelmeta().custom_metadata_map.get(CARD_KEY, "null"))
+    except ValueError as error:
+        raise WeightsError(f"{path} has no model card ({error}): make it anew with prim-train export") from error
+    if card.stage != stage:
+        raise WeightsError(f"{path} is a network for {card.stage}, not for {stage}")
+    if mapper is not None and card.mapper != mapper:
+        raise WeightsError(f"{path} reads the maps of {card.mapper}, not of {mapper}: use --mapper {card.mapper}")
+    return Weights(path, card, session)
