@@ -49,8 +49,9 @@ NEVER_NOTHING = 1e-10
 SPENT = 1e-5
 """A ray is followed until no more than this chance is left that it came so far."""
 
-BEYOND = 0.5
-"""The chance that a ray which leaves the grid meets something before range_max."""
+BEFORE, BEYOND = 0.5, 0.5
+"""The chances that a ray meets something before it comes to the grid, where its sensor stands off it; and that one
+which leaves the grid meets something before range_max."""
 
 WILD_TAIL = 0.1
 """The share of wild measurements that read as too near, and as no return; the rest is spread over all ranges."""
@@ -123,6 +124,25 @@ def beyond(kind: int, z: float, z_min: float, z_max: float, exit_at: float, sigm
 
 
 @inline
+def before(kind: int, z: float, z_min: float, z_max: float, entry: float, sigma: float, table: Any) -> float:
+    """The likelihood of a measurement whose ray was stopped before it came to the grid at ``entry``, as beyond.
+
+    What lies between a sensor off the grid and the grid is anywhere there.
+    """
+    if entry <= 0:
+        return 0.0
+    if kind == MEASURED:
+        return (
+            BEFORE
+            * (looked_up(table, NO_RETURN, z / sigma) - looked_up(table, NO_RETURN, (z - entry) / sigma))
+            / entry
+        )
+    limit = z_min if kind == TOO_NEAR else z_max
+    nearer = sigma * (normal_cdf_integral(limit / sigma) - normal_cdf_integral((limit - entry) / sigma)) / entry
+    return BEFORE * nearer if kind == TOO_NEAR else BEFORE * max(1 - nearer, 0.0)
+
+
+@inline
 def wild(kind: int, z_min: float, z_max: float) -> float:
     """The likelihood of a measurement that has nothing to do with the map."""
     return (1 - 2 * WILD_TAIL) / (z_max - z_min) if kind == MEASURED else WILD_TAIL
@@ -166,22 +186,28 @@ def lay(x: float, y: float, dx: float, dy: float, rows: int, cols: int) -> tuple
     return first, last, cell * a_stride, major, b_stride, offset, tilt, start, step
 
 
-fused = compiled(fastmath={"contract"})
+part = compiled(cache=False, forceinline=True)
+"""A part of the kernels below."""
+
+fused = compiled(cache=False, forceinline=True, fastmath={"contract"})
 """Multiplication and addition in one step."""
 
-fast = compiled(fastmath={"nsz", "contract", "reassoc", "nnan"})
+fast = compiled(cache=False, forceinline=True, fastmath={"nsz", "contract", "reassoc", "nnan"})
 """Sums in any order, so that they can be taken eight at a time."""
 
 
 @fused
-def walk(line: Any, stop: int, x_start: Any, x_step: Any, flat: Any, where: Any, chance: Any, apart: Any) -> Any:
+def walk(
+    line: Any, stop: int, left: Any, x_start: Any, x_step: Any, flat: Any, where: Any, chance: Any, apart: Any
+) -> Any:
     """Follows a ray until it is spent or at step ``stop``; returns how many cells it came to, and what is left of it.
+
+    ``left`` is the chance that it comes to the first.
 
     Fills, for each cell: ``where`` (flat index), ``chance`` (to come that far), ``apart`` ((s - z) / sigma). Whether
     the ray is spent is looked up after every CHUNK cells: a test at each would hold up all that follows it.
     """
     first, start, major, minor, offset, tilt = line
-    left = np.float32(1.0)
     count = 0
     step = first
     c, along = start + first * major, offset + first * tilt
@@ -226,7 +252,7 @@ def weigh_range(count: int, where: Any, chance: Any, apart: Any, flat: Any, shar
     return total
 
 
-@kernel
+@part
 def weigh_cut(row: int, count: int, where: Any, chance: Any, apart: Any, flat: Any, table: Any, share: Any) -> Any:
     """As weigh_range, for a measurement that was cut off at one end of the sensor's range: weights from a table."""
     total = np.float32(0)
@@ -251,7 +277,7 @@ def moments(count: int, factor: Any, share: Any, apart: Any) -> Any:
     return stops, squares
 
 
-@kernel
+@part
 def moments_cut(row: int, count: int, factor: Any, share: Any, apart: Any, table: Any) -> Any:
     """As moments, with the noise's second moment from a table."""
     stops, squares = np.float32(0), np.float32(0)
@@ -264,7 +290,7 @@ def moments_cut(row: int, count: int, factor: Any, share: Any, apart: Any, table
     return stops, squares
 
 
-@kernel
+@part
 def scatter(count: int, behind: Any, share: Any, where: Any, sums: Any, certain: bool) -> None:
     """Adds a ray's responsibilities to its cells, from the last one back; ``behind`` is what lies beyond them."""
     for i in range(count - 1, -1, -1):
@@ -352,14 +378,14 @@ def expect(
         if first > last:
             continue
         kind, z, furthest = measured(z, z_min, z_max, spread)
-        if furthest < s0 + (first - 0.5) * ds:  # it ended before the grid begins
-            continue
+        entry = 0.0 if 0 <= x < cols and 0 <= y < rows else s0 + (first - 0.5) * ds
         exit_at = s0 + (last + 0.5) * ds
         leaves = exit_at <= furthest
         stop = last if leaves else min(last, int((furthest - s0) / ds))
         line = (first + (leads[i] if len(leads) else 0), start, major, minor, offset, tilt)
         x_start, x_step = np.float32((s0 - z) * inverse_spread), np.float32(ds * inverse_spread)
-        count, left = walk(line, stop, x_start, x_step, flat, where, chance, apart)
+        comes = np.float32(1.0 if entry <= 0 else 1 - BEFORE)
+        count, left = walk(line, stop, comes, x_start, x_step, flat, where, chance, apart)
         gone = 0.0
         if left >= SPENT and leaves:
             gone = left * beyond(kind, z, z_min, z_max, exit_at, spread, table)
@@ -372,7 +398,8 @@ def expect(
             scale = 1.0
             total = weigh_cut(kind, count, where, chance, apart, flat, table, share)
         wildness = epsilon * wild(kind, z_min, z_max)
-        density = (1 - epsilon) * (total * scale + gone) + wildness
+        ahead = before(kind, z, z_min, z_max, entry, spread, table)
+        density = (1 - epsilon) * (total * scale + gone + ahead) + wildness
         weight = (1 - epsilon) / density
         factor = np.float32(scale * weight)
         if kind == MEASURED:

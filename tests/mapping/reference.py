@@ -70,11 +70,10 @@ def expect(
         if not cells:
             continue
         near, none = z == -math.inf, z >= z_max
-        furthest = z_max if none else (z_min if near else z) + 6 * sigma
+        outside = not (0 <= x < o.shape[1] and 0 <= y < o.shape[0])
         half = 0.5 / max(abs(math.cos(angle)), abs(math.sin(angle)))
-        if furthest < cells[0][2] - half:  # it ended before the grid begins
-            continue
-        left, parts, squares = 1.0, [], []
+        entry = cells[0][2] - half if outside else 0.0
+        left, parts, squares = 0.5 if entry > 0 else 1.0, [], []
         for row, col, s in cells:
             if none and s > z_max:
                 break
@@ -91,10 +90,11 @@ def expect(
             left *= 1 - o[row, col]
         gone = left * _beyond(z, near, none, leaves, z_min, z_max, sigma)
         wild = epsilon * (WILD_TAIL if near or none else (1 - 2 * WILD_TAIL) / (z_max - z_min))
-        density = (1 - epsilon) * (sum(parts) + gone) + wild
+        density = (1 - epsilon) * (sum(parts) + gone + _before(z, near, none, entry, z_min, z_max, sigma)) + wild
         q = [(1 - epsilon) * part / density for part in parts]
         behind = (1 - epsilon) * gone / density
-        sums.worst_sum = max(sums.worst_sum, abs(sum(q) + behind + wild / density - 1))
+        stopped_before = (1 - epsilon) * _before(z, near, none, entry, z_min, z_max, sigma) / density
+        sums.worst_sum = max(sums.worst_sum, abs(sum(q) + behind + stopped_before + wild / density - 1))
         for (row, col, _), share in reversed(list(zip(cells, q, strict=False))):
             sums.hits[row, col] += share
             sums.passes[row, col] += behind
@@ -105,6 +105,17 @@ def expect(
         sums.squares += sum(share * square for share, square in zip(q, squares, strict=True))
         sums.wild += wild / density
     return sums
+
+
+def _before(z: float, near: bool, none: bool, entry: float, z_min: float, z_max: float, sigma: float) -> float:
+    """Half of the rays from off the grid are stopped anywhere before it."""
+    if entry <= 0:
+        return 0.0
+    if not near and not none:
+        return 0.5 * (cdf(z / sigma) - cdf((z - entry) / sigma)) / entry
+    limit = z_min if near else z_max
+    nearer = sigma * (cdf_integral(limit / sigma) - cdf_integral((limit - entry) / sigma)) / entry
+    return 0.5 * (nearer if near else 1 - nearer)
 
 
 def _beyond(z: float, near: bool, none: bool, leaves: float, z_min: float, z_max: float, sigma: float) -> float:

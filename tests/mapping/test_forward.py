@@ -3,7 +3,11 @@
 from __future__ import annotations
 
 import math
+import os
+import subprocess
+import sys
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -14,7 +18,8 @@ from bench.sessions import Session, recorded
 from mapping.calibration import known
 from mapping.forward import ForwardMapper, coarser, find_noise
 from mapping.grid import GridFrame
-from mapping.level import ALL, Choice, Level, Noise, Rays
+from mapping.level import ALL, Choice, Level, Noise, Rays, smoothing_width
+from mapping.sieve import taps
 from prim.errors import UsageError
 from prim.frames import Pose2D, Scan
 from prim.metrics import map_scores
@@ -81,18 +86,41 @@ def test_the_e_step_is_the_reference_s(seed: int, sigma: float) -> None:
 
 
 @pytest.mark.parametrize("sigma", [0.3, 2.0, 7.0])
-@pytest.mark.parametrize("angle", [0.0, 0.7, 2.2, -1.9])
-def test_a_ray_s_density_is_normalised(sigma: float, angle: float) -> None:
+@pytest.mark.parametrize(
+    ("x", "y", "angle"), [(11.3, 12.8, 0.0), (11.3, 12.8, 0.7), (11.3, 12.8, -1.9), (-3.0, 5.0, 0.3)]
+)
+def test_a_ray_s_density_is_normalised(sigma: float, x: float, y: float, angle: float) -> None:
     o = a_map(np.random.default_rng(5)) * 0.3
     edges = np.linspace(LIMITS[0], LIMITS[1], 3001)
     middles = (edges[:-1] + edges[1:]) / 2
     total = 0.0
     for z in (*middles, -np.inf, np.inf):
         rays = Rays()
-        rays.add(a_scan([z], angle, 0.0), Pose2D(11.3, 12.8))
+        rays.add(a_scan([z], angle, 0.0), Pose2D(x, y))
         _, totals = level_of(o).expect(rays, Noise(sigma, 0.05))
         total += math.exp(totals.log_likelihood) * (edges[1] - edges[0] if np.isfinite(z) else 1)
     assert total == pytest.approx(1, abs=2e-3)
+
+
+def test_the_m_step_of_the_sieve_is_exact() -> None:
+    """Against the sieve written as one matrix, borders and all."""
+    rng = np.random.default_rng(4)
+    level = Level(FRAME, 0.1)
+    level.smooth(20.0)
+    p = rng.uniform(0.01, 0.9, (SIZE, SIZE)).astype(np.float32)
+    level.restore(p.copy())
+    weights = taps(smoothing_width(20.0, 1.0))
+    n = len(weights) // 2
+    line = np.array([[weights[n + j - i] if abs(i - j) <= n else 0.0 for j in range(SIZE)] for i in range(SIZE)])
+    line /= line.sum(axis=1, keepdims=True)
+    blur = np.kron(line, line)
+    o = blur @ p.ravel()
+    assert level.stopping.ravel() == pytest.approx(o, rel=1e-4)
+    sums = rng.uniform(0, 5, (2, SIZE * SIZE, 2)).astype(np.float32)
+    hits, passes = sums.sum(axis=0).T
+    up, down = p.ravel() * (blur.T @ (hits / o)), (1 - p.ravel()) * (blur.T @ (passes / (1 - o)))
+    level.maximize(sums)
+    assert level.parameters.ravel() == pytest.approx(up / (up + down), rel=1e-3)
 
 
 def test_responsibilities_sum_to_1_within_walls() -> None:
@@ -201,6 +229,22 @@ def test_any_number_of_threads_gives_the_same_bits(noisiest: Session) -> None:
     first, second = one.finish(), three.finish()
     assert first.probability.tobytes() == second.probability.tobytes()
     assert one.noise_std == three.noise_std
+
+
+@pytest.mark.slow
+def test_code_from_the_cache_gives_the_same_bits_as_fresh_code(tmp_path: Path) -> None:
+    """What the compiler makes of the kernels must not depend on whether it had made parts of them before."""
+    program = (
+        "import hashlib\n"
+        "from tests.mapping.test_forward import mapper_of, session_of\n"
+        "print(hashlib.sha256(mapper_of(session_of(0.25)).finish().probability.tobytes()).hexdigest())\n"
+    )
+    environment = os.environ | {"NUMBA_CACHE_DIR": str(tmp_path)}
+    printed = {
+        subprocess.run([sys.executable, "-c", program], env=environment, capture_output=True, check=True).stdout
+        for _ in range(2)
+    }
+    assert len(printed) == 1
 
 
 def test_cut_off_ranges_are_counted(noisiest: Session) -> None:
