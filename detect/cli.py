@@ -199,7 +199,7 @@ def need_extra() -> None:
     """Raises UsageError where torch and ultralytics are not installed."""
     missing = [name for name in ("torch", "ultralytics") if find_spec(name) is None]
     if missing:
-        raise UsageError(f"training needs {' and '.join(missing)}: pip install 'prim[train]'")
+        raise UsageError(f"training needs {' and '.join(missing)}: pip install -e '.[train]', where prim was cloned")
 
 
 def kinds_of(names: Sequence[KindName]) -> list[KindName]:

@@ -51,7 +51,7 @@ def test_impossible_options(run: Run, arguments: list[str], said: str) -> None:
 def test_without_torch_the_extra_is_named(run: Run, monkeypatch: pytest.MonkeyPatch, command: str) -> None:
     monkeypatch.setattr(cli, "find_spec", lambda name: None)
     code, _, err = run(command, "set", "out")
-    assert code == 2 and "pip install 'prim[train]'" in err and err.count("\n") == 1
+    assert code == 2 and "pip install -e '.[train]'" in err and err.count("\n") == 1
 
 
 def test_weights_that_can_run_code_must_be_trusted(run: Run) -> None:
