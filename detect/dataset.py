@@ -7,6 +7,7 @@ A set is a folder:
     images/prob/train/000012_0.png    the tile as each mapper maps it (OccupancyGrid.image, row 0 at the smallest y)
     labels/prob/train/000012_0.txt    the same tile's boxes as YOLO reads them
     prob.yaml                     what ultralytics trains from
+    done/train/000012             says that all tiles of a session are there
 
 Everything follows from a session's seed: sessions are made in parallel, one that is there already is not made again,
 and a set that was interrupted goes on where it stopped. This is the one part of ``detect`` that uses ``recorder``.
@@ -27,7 +28,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mapping.grid import GridFrame, OccupancyGrid
+from mapping.grid import UNKNOWN_GREY, GridFrame, OccupancyGrid
 from mapping.mapper import MAPPERS, make_mapper
 from prim.errors import OutputError, UsageError
 from prim.frames import Pose2D, Scan, Trajectory
@@ -259,10 +260,6 @@ def cut(grid: OccupancyGrid, tile: GridFrame) -> NDArray[np.uint8]:
         shared = GridFrame(frame.resolution, row, col, last_row - row, last_col - col)
         image[tile.window(shared)] = grid.image()[frame.window(shared)]
     return image
-
-
-UNKNOWN_GREY = 128
-"""What 0.5 becomes in an image."""
 
 
 def share_inside(primitive: Primitive, tile: GridFrame) -> float:

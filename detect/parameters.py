@@ -18,6 +18,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from mapping.grid import UNKNOWN_GREY
 from prim.shapes import Kind, Primitive
 
 Box = tuple[float, float, float, float]
@@ -31,8 +32,6 @@ TURNS = {Kind.SQUARE: 4, Kind.RECTANGLE: 2, Kind.TRIANGLE: 1, Kind.ELLIPSE: 2}
 
 SIZES = {Kind.SQUARE: 1, Kind.RECTANGLE: 2, Kind.CIRCLE: 1, Kind.TRIANGLE: 2, Kind.ELLIPSE: 2}
 """How many sizes a kind has."""
-
-UNKNOWN = 128
 
 
 @dataclass(frozen=True)
@@ -65,7 +64,7 @@ def crop(image: NDArray[np.uint8], box: Box, preset: Preset) -> NDArray[np.uint8
     rows, cols = image.shape
     left, top, right, bottom = box
     col, row = round((left + right) / 2 - preset.window / 2), round((top + bottom) / 2 - preset.window / 2)
-    window = np.full((preset.window, preset.window), UNKNOWN, np.uint8)
+    window = np.full((preset.window, preset.window), UNKNOWN_GREY, np.uint8)
     first_col, last_col, first_row, last_row = col, col + preset.window, row, row + preset.window
     if preset.isolated:
         first_col, last_col = max(first_col, math.floor(left) - 1), min(last_col, math.ceil(right) + 1)

@@ -13,6 +13,9 @@ from prim.errors import UsageError
 from prim.world import Bounds
 
 UNKNOWN = np.float32(0.5)
+UNKNOWN_GREY = 128
+"""What a probability of 0.5 is in an image."""
+
 EVIDENCE_TOP = 10_000.0
 """In an image, this many rays to a cell are white."""
 
