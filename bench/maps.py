@@ -100,13 +100,13 @@ def median(values: list[float | None]) -> str:
     return f"{statistics.median(known):.3f}" if known else "–"
 
 
-def measure(sessions: int) -> dict[tuple[float, str], list[str]]:
+def measure(sessions: int, first_seed: int = 0) -> dict[tuple[float, str], list[str]]:
     """The medians of each noise level and row."""
     medians = {}
     with ProcessPoolExecutor(os.cpu_count()) as pool:
         lines = list(pool.map(calibration, NOISE_LEVELS))
         for noise_std, line in zip(NOISE_LEVELS, lines, strict=True):
-            jobs = [(seed, noise_std, line) for seed in range(sessions)]
+            jobs = [(seed, noise_std, line) for seed in range(first_seed, first_seed + sessions)]
             found = list(pool.map(scores_of, jobs, chunksize=2))
             for row in ROWS:
                 columns = zip(*(scores[row] for scores in found), strict=True)
@@ -135,10 +135,11 @@ def update(path: Path, name: str, content: str) -> None:
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("--sessions", type=int, default=50)
+    parser.add_argument("--first-seed", type=int, default=0)
     parser.add_argument("--update", type=Path, help="the document that gets the whole table")
     parser.add_argument("--short", type=Path, help="the document that gets the short one")
     options = parser.parse_args()
-    measured = measure(options.sessions)
+    measured = measure(options.sessions, options.first_seed)
     if options.update:
         update(options.update, "bench-maps", table(measured, ROWS, COLUMNS))
     if options.short:
