@@ -4,7 +4,7 @@ A set is a folder:
 
     manifest.json                 the options, so that the same set can be made again
     truth/train/000012_0.json     one tile: where it lies, its primitives, how it was recorded
-    images/prob/train/000012_0.png    the tile as each mapper maps it (OccupancyGrid.image, row 0 at the smallest y)
+    images/prob/train/000012_0.png    the tile as each mapper maps it (detect.tiles.cut, row 0 at the smallest y)
     labels/prob/train/000012_0.txt    the same tile's boxes as YOLO reads them
     prob.yaml                     what ultralytics trains from
     done/train/000012             says that all tiles of a session are there
@@ -16,7 +16,6 @@ and a set that was interrupted goes on where it stopped. This is the one part of
 from __future__ import annotations
 
 import json
-import math
 import os
 import tempfile
 from collections.abc import Callable, Iterator, Sequence
@@ -28,7 +27,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mapping.grid import UNKNOWN_GREY, GridFrame, OccupancyGrid
+from detect.tiles import TILE, cut, tiles
+from mapping.grid import GridFrame, OccupancyGrid
 from mapping.mapper import MAPPERS, make_mapper
 from prim.errors import OutputError, UsageError
 from prim.frames import Pose2D, Scan, Trajectory
@@ -39,12 +39,6 @@ from prim.world import Bounds
 from recorder.sensors import Lidar
 from recorder.session import SessionOptions, record
 from recorder.world import WorldOptions
-
-TILE = 224
-"""Side of an image in cells: a multiple of 32, as YOLO wants it, and enough for the paper's 2 x 2 m and a margin."""
-
-OVERLAP = 64
-"""Tiles of a larger map overlap by this many cells: more than any primitive is wide."""
 
 MARGIN = 0.1
 """A map reaches this far (m) beyond the floor."""
@@ -66,6 +60,7 @@ class SetOptions:
 
     ``sizes`` are the splits' sessions; each draws one of ``noise_stds`` (m), ``rays``, ``floors`` (side, m) and
     ``motions``, has walls with the chance ``walled``, and is mapped by each of ``mappers``.
+    Images of the mappers that are ``rounded`` show cells as occupied, free or unknown only (detect.tiles.STYLES).
     """
 
     sizes: tuple[int, int] = (500, 125)
@@ -79,6 +74,7 @@ class SetOptions:
     motions: tuple[str, ...] = ("warp",)
     walled: float = 1.0
     resolution: float = 0.01
+    rounded: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         for name in ("noise_stds", "mappers", "kinds", "rays", "stops", "floors", "motions"):
@@ -94,7 +90,7 @@ class SetOptions:
 
 
 PRESETS = {
-    "paper": SetOptions(),
+    "paper": SetOptions(rounded=("det", "prob")),
     "mixed": SetOptions(
         sizes=(4000, 400),
         seed=200_000,
@@ -106,7 +102,7 @@ PRESETS = {
         walled=0.7,
     ),
 }
-"""The paper's sets (III-B, IV-B: 500 and 125 maps, one noise level each), and one for networks that are shipped."""
+"""The paper's sets (III-B, IV-B: 500 and 125 maps, one noise level each, rounded), and one for shipped networks."""
 
 
 def sessions(options: SetOptions) -> Iterator[tuple[str, int]]:
@@ -192,7 +188,8 @@ def _make_session(folder: Path, options: SetOptions, split: str, seed: int) -> N
         held = [primitive for primitive in world.primitives if share_inside(primitive, tile) >= LEAST_INSIDE]
         name = f"{seed:06d}_{number}"
         for mapper, grid in grids.items():
-            write_image(folder / "images" / mapper / split / f"{name}.png", cut(grid, tile))
+            style = "rounded" if mapper in options.rounded else "grey"
+            write_image(folder / "images" / mapper / split / f"{name}.png", cut(grid, tile, style))
             label = "".join(yolo_line(primitive, tile) for primitive in held)
             (folder / "labels" / mapper / split / f"{name}.txt").write_text(label, encoding="utf-8")
         truth = {
@@ -231,35 +228,6 @@ def map_scans(mapper: str, scans: Sequence[tuple[Scan, Pose2D]], resolution: flo
     for scan, pose in scans:
         made.update(scan, pose)
     return made.finish()
-
-
-def tiles(frame: GridFrame) -> Iterator[GridFrame]:
-    """Frames of TILE x TILE cells that cover a map, evenly spread, each overlapping the next by OVERLAP at least."""
-    for row in _starts(frame.row, frame.rows):
-        for col in _starts(frame.col, frame.cols):
-            yield GridFrame(frame.resolution, row, col, TILE, TILE)
-
-
-def _starts(first: int, cells: int) -> list[int]:
-    """Where tiles begin along one axis; a single tile is centred on the map."""
-    if cells <= TILE:
-        return [first - (TILE - cells) // 2]
-    count = math.ceil((cells - OVERLAP) / (TILE - OVERLAP))
-    return [first + round(k * (cells - TILE) / (count - 1)) for k in range(count)]
-
-
-def cut(grid: OccupancyGrid, tile: GridFrame) -> NDArray[np.uint8]:
-    """A tile's image (TILE, TILE, 3); what lies beyond the map is unknown."""
-    image = np.zeros((tile.rows, tile.cols, 3), np.uint8)
-    image[..., 0] = UNKNOWN_GREY
-    frame = grid.frame
-    row, col = max(tile.row, frame.row), max(tile.col, frame.col)
-    last_row = min(tile.row + tile.rows, frame.row + frame.rows)
-    last_col = min(tile.col + tile.cols, frame.col + frame.cols)
-    if row < last_row and col < last_col:
-        shared = GridFrame(frame.resolution, row, col, last_row - row, last_col - col)
-        image[tile.window(shared)] = grid.image()[frame.window(shared)]
-    return image
 
 
 def share_inside(primitive: Primitive, tile: GridFrame) -> float:

@@ -11,8 +11,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from detect.crops import Crops, mirrored, turned
-from detect.dataset import TILE, box_of, cut, share_inside, tiles, yolo_line
+from detect.dataset import box_of, share_inside, yolo_line
 from detect.parameters import LONGEST, PAPER, PRIM, Preset, crop, placed, read_outputs, targets
+from detect.tiles import TILE, cut, tiles
 from mapping.grid import GridFrame, OccupancyGrid
 from prim.shapes import Kind, Primitive, angle_error
 from prim.world import World
