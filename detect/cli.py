@@ -26,6 +26,15 @@ class MapperName(StrEnum):
     FORWARD = "forward"
 
 
+class ImagesName(StrEnum):
+    """What YOLO can learn from: a mapper's maps, or drawings."""
+
+    DET = "det"
+    PROB = "prob"
+    FORWARD = "forward"
+    DRAWINGS = "drawings"
+
+
 class KindName(StrEnum):
     """The kinds of primitives, and all of them."""
 
@@ -49,6 +58,14 @@ class PresetName(StrEnum):
 
     PRIM = "prim"
     PAPER = "paper"
+
+
+class YoloPresetName(StrEnum):
+    """The presets of YOLO's training."""
+
+    PRIM = "prim"
+    PAPER = "paper"
+    DRAWINGS = "drawings"
 
 
 def _show_version(wanted: bool) -> None:
@@ -107,6 +124,26 @@ def dataset(
 
 
 @train.command()
+def drawings(
+    folder: Annotated[Path, typer.Argument(metavar="FOLDER", help="Where the set is made, or gone on with.")],
+    images: Annotated[
+        tuple[int, int], typer.Option(metavar="TRAIN VAL", help="Drawings to train on and to validate on.")
+    ] = (6000, 100),
+    seed: Annotated[int, typer.Option(metavar="N", help="The first drawing's seed.")] = 900_000,
+    quiet: Annotated[bool, typer.Option("--quiet", help="Print errors only.")] = False,
+    debug: Annotated[bool, typer.Option("--debug", help="Show tracebacks.")] = False,
+) -> int:
+    """Draw primitives to begin training from, where no pretrained weights are at hand: maps of no world."""
+    from detect.drawings import DrawingOptions, make_drawings
+
+    with console.progress_bar("drawings", quiet) as progress:
+        made = make_drawings(folder, DrawingOptions(images, seed), progress)
+    if not quiet:
+        typer.echo(f"made {made} of {sum(images)} drawings in {folder} ({sum(images) - made} were there)")
+    return 0
+
+
+@train.command()
 def cnn(
     data: Annotated[Path, typer.Argument(metavar="SET", help="A set made by prim-train dataset.")],
     output: Annotated[Path, typer.Argument(metavar="FOLDER", help="Where checkpoints go: cnn.MAPPER.KIND.pt.")],
@@ -144,8 +181,8 @@ def cnn(
 def yolo(
     data: Annotated[Path, typer.Argument(metavar="SET", help="A set made by prim-train dataset.")],
     output: Annotated[Path, typer.Argument(metavar="FOLDER", help="Where ultralytics leaves its run.")],
-    mapper: Annotated[MapperName, typer.Option(help="Whose maps to learn from.")] = MapperName.FORWARD,
-    preset: Annotated[PresetName, typer.Option(help="Ours, or the paper's settings.")] = PresetName.PRIM,
+    mapper: Annotated[ImagesName, typer.Option(help="Whose maps to learn from.")] = ImagesName.FORWARD,
+    preset: Annotated[YoloPresetName, typer.Option(help="Ours, the paper's settings, or for drawings.")] = YoloPresetName.PRIM,
     epochs: Annotated[
         int | None, typer.Option(metavar="N", help="Passes over the set. [default: the preset's]")
     ] = None,

@@ -5,7 +5,7 @@ A set is a folder:
     manifest.json                 the options, so that the same set can be made again
     truth/train/000012_0.json     one tile: where it lies, its primitives, how it was recorded
     images/prob/train/000012_0.png    the tile as each mapper maps it (detect.tiles.cut, row 0 at the smallest y)
-    labels/prob/train/000012_0.txt    the same tile's boxes as YOLO reads them
+    labels/prob/train/000012_0.txt    the same tile's outlines as YOLO reads them
     prob.yaml                     what ultralytics trains from
     done/train/000012             says that all tiles of a session are there
 
@@ -146,7 +146,7 @@ def make(folder: Path, options: SetOptions, progress: Progress | None = None, wo
             if progress:
                 progress(count, len(missing))
     for mapper in options.mappers:
-        _write_yaml(folder, mapper)
+        write_yaml(folder, mapper)
     return len(missing)
 
 
@@ -238,10 +238,12 @@ def share_inside(primitive: Primitive, tile: GridFrame) -> float:
 
 
 def yolo_line(primitive: Primitive, tile: GridFrame) -> str:
-    """A primitive's label: class, and its box's centre and size as shares of the image."""
-    x0, y0, x1, y1 = box_of(primitive, tile)
-    cx, cy, w, h = (x0 + x1) / 2, (y0 + y1) / 2, x1 - x0, y1 - y0
-    return f"{KINDS.index(primitive.kind)} {cx / TILE:.6f} {cy / TILE:.6f} {w / TILE:.6f} {h / TILE:.6f}\n"
+    """A primitive's label: class, and its outline's points as shares of the image, cut to the tile.
+
+    Points and no box, since training turns images, and a turned box's box is larger than a turned outline's.
+    """
+    points = np.clip(primitive.outline() / tile.resolution - (tile.col, tile.row), 0, TILE) / TILE
+    return " ".join([str(KINDS.index(primitive.kind)), *(f"{value:.6f}" for value in points.ravel())]) + "\n"
 
 
 def box_of(primitive: Primitive, tile: GridFrame) -> tuple[float, float, float, float]:
@@ -260,7 +262,7 @@ def write_image(path: Path, image: NDArray[np.uint8]) -> None:
     part.replace(path)
 
 
-def _write_yaml(folder: Path, mapper: str) -> None:
+def write_yaml(folder: Path, mapper: str) -> None:
     """What ultralytics trains from."""
     names = "".join(f"  {k}: {kind.value}\n" for k, kind in enumerate(KINDS))
     text = f"path: {folder.resolve()}\ntrain: images/{mapper}/train\nval: images/{mapper}/val\nnames:\n{names}"

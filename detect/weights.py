@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import json
+import os
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from prim.errors import PrimError
+from prim.shapes import Kind
 
 if TYPE_CHECKING:
     import onnxruntime
@@ -17,8 +19,15 @@ SCHEMA = "prim-weights/1"
 CARD_KEY = "prim"
 """The card's key in the file's metadata."""
 
+STAGES = ("yolo", "cnn")
+
 PICKLES = (b"\x80", b"PK")
 """How a pickle begins, bare or in torch's archive."""
+
+DETECTOR = "yolo.onnx"
+"""A folder of weights holds YOLO under this name, and the networks that read parameters under any other."""
+
+ALL_KINDS = tuple(kind.value for kind in Kind)
 
 
 class WeightsError(PrimError):
@@ -27,13 +36,21 @@ class WeightsError(PrimError):
 
 @dataclass(frozen=True)
 class Card:
-    """What a network is for: the ``stage`` (yolo or cnn), whose maps it reads, and what is known of its making."""
+    """What a network is for, and what is known of its making.
+
+    ``stage``: yolo or cnn; ``mapper``: whose maps it reads; ``kinds``: in the order of its outputs; ``preset``: how a
+    cnn's crops are made (detect.parameters); ``style``: how cells are shown (detect.tiles.STYLES); ``resolution``: of
+    the maps (m); ``thresholds``: of a yolo, the least score per kind; ``about``: data, options, metrics.
+    """
 
     stage: str
     mapper: str
-    kind: str | None = None
+    kinds: tuple[str, ...] = ALL_KINDS
     preset: str | None = None
     channels: int = 3
+    style: str = "grey"
+    resolution: float = 0.01
+    thresholds: Mapping[str, float] = field(default_factory=dict)
     about: Mapping[str, Any] = field(default_factory=dict)
 
     def to_json(self) -> str:
@@ -47,9 +64,12 @@ class Card:
         if not isinstance(value, dict) or value.pop("schema", None) != SCHEMA:
             raise ValueError(f"no {SCHEMA}")
         try:
-            return cls(**value)
+            card = cls(**value | {"kinds": tuple(value.get("kinds", ALL_KINDS))})
         except TypeError as error:
             raise ValueError(str(error)) from error
+        if card.stage not in STAGES or not set(card.kinds) <= set(ALL_KINDS):
+            raise ValueError("an unknown stage or kind")
+        return card
 
 
 @dataclass(frozen=True)
@@ -61,8 +81,8 @@ class Weights:
     session: onnxruntime.InferenceSession
 
 
-def load_weights(path: Path, stage: str, mapper: str | None = None, threads: int = 0) -> Weights:
-    """Opens a network of a ``stage``, for the maps of ``mapper`` where one is named.
+def load_weights(path: Path, stage: str, mapper: str | None = None, threads: int | None = None) -> Weights:
+    """Opens a network of a ``stage``, for the maps of ``mapper`` where one is named; runs on all cores by default.
 
     Raises WeightsError on a file that is missing, corrupt, a pickle, without a card, or for something else.
     """
@@ -75,7 +95,7 @@ def load_weights(path: Path, stage: str, mapper: str | None = None, threads: int
     if content.startswith(PICKLES):
         raise WeightsError(f"{path} is a pickle, which can run code: make an ONNX file of it with prim-train export")
     options = onnxruntime.SessionOptions()
-    options.intra_op_num_threads = threads
+    options.intra_op_num_threads = threads or len(os.sched_getaffinity(0))
     options.log_severity_level = 4
     try:
         session = onnxruntime.InferenceSession(content, options, providers=["CPUExecutionProvider"])
@@ -91,3 +111,19 @@ def load_weights(path: Path, stage: str, mapper: str | None = None, threads: int
     if mapper is not None and card.mapper != mapper:
         raise WeightsError(f"{path} reads the maps of {card.mapper}, not of {mapper}: use --mapper {card.mapper}")
     return Weights(path, card, session)
+
+
+def load_set(path: Path, mapper: str | None = None, threads: int | None = None) -> tuple[Weights, list[Weights]]:
+    """Opens a YOLO and the networks that read parameters beside it: a folder, or the YOLO's own file in it.
+
+    Raises WeightsError as :func:`load_weights`, and where a kind's network is missing.
+    """
+    detector = path / DETECTOR if path.is_dir() else path
+    yolo = load_weights(detector, "yolo", mapper, threads)
+    others = sorted(other for other in detector.parent.glob("*.onnx") if other.name != detector.name)
+    networks = [load_weights(other, "cnn", yolo.card.mapper, threads) for other in others]
+    missing = set(ALL_KINDS).difference(*(network.card.kinds for network in networks))
+    if missing:
+        what = ", ".join(sorted(missing))
+        raise WeightsError(f"{detector.parent} holds no network that reads the parameters of: {what}")
+    return yolo, networks
