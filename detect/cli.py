@@ -146,9 +146,9 @@ def drawings(
 @train.command()
 def cnn(
     data: Annotated[Path, typer.Argument(metavar="SET", help="A set made by prim-train dataset.")],
-    output: Annotated[Path, typer.Argument(metavar="FOLDER", help="Where checkpoints go: cnn.MAPPER.KIND.pt.")],
+    output: Annotated[Path, typer.Argument(metavar="FOLDER", help="Where checkpoints go: cnn.MAPPER[.KIND].pt.")],
     mapper: Annotated[MapperName, typer.Option(help="Whose maps to learn from.")] = MapperName.FORWARD,
-    kind: Annotated[KindName, typer.Option(help="Whose network to train.")] = KindName.ALL,
+    kind: Annotated[KindName, typer.Option(help="The kind, or kinds, to read.")] = KindName.ALL,
     preset: Annotated[PresetName, typer.Option(help="Ours, or the paper's settings.")] = PresetName.PRIM,
     epochs: Annotated[
         int | None, typer.Option(metavar="N", help="Passes over the set. [default: the preset's]")
@@ -157,23 +157,27 @@ def cnn(
     quiet: Annotated[bool, typer.Option("--quiet", help="Print errors only.")] = False,
     debug: Annotated[bool, typer.Option("--debug", help="Show tracebacks.")] = False,
 ) -> int:
-    """Train the networks that read a primitive's parameters from a crop. An interrupted run goes on."""
+    """Train the networks that read a primitive's parameters from a crop. An interrupted run goes on.
+
+    Ours is one network for all kinds; the paper's are one for each.
+    """
     need_extra()
-    from detect.train import CNN_PRESETS, train_cnn
+    from detect.train import CNN_PRESETS, checkpoint_name, networks_of, train_cnn
     from prim.shapes import Kind
 
     options = dataclasses.replace(CNN_PRESETS[preset.value], seed=seed)
     if epochs is not None:
         options = dataclasses.replace(options, epochs=epochs)
     output.mkdir(parents=True, exist_ok=True)
-    for name in kinds_of([kind]):
+    for kinds in networks_of(options.preset, [Kind(name.value) for name in kinds_of([kind])]):
+        name = "cnn" if len(kinds) == len(Kind) else "-".join(kinds)
 
-        def tell(done: int, total: int, loss: float, validation: float, name: KindName = name) -> None:
+        def tell(done: int, total: int, loss: float, validation: float, name: str = name) -> None:
             if not quiet:
-                typer.echo(f"{name.value}: epoch {done} of {total}, loss {loss:.5f}, validation {validation:.5f}")
+                typer.echo(f"{name}: epoch {done} of {total}, loss {loss:.5f}, validation {validation:.5f}")
 
-        path = output / f"cnn.{mapper.value}.{name.value}.pt"
-        train_cnn(data, mapper.value, Kind(name.value), path, options, tell)
+        path = output / checkpoint_name(mapper.value, kinds)
+        train_cnn(data, mapper.value, kinds, path, options, tell)
     return 0
 
 
@@ -182,7 +186,9 @@ def yolo(
     data: Annotated[Path, typer.Argument(metavar="SET", help="A set made by prim-train dataset.")],
     output: Annotated[Path, typer.Argument(metavar="FOLDER", help="Where ultralytics leaves its run.")],
     mapper: Annotated[ImagesName, typer.Option(help="Whose maps to learn from.")] = ImagesName.FORWARD,
-    preset: Annotated[YoloPresetName, typer.Option(help="Ours, the paper's settings, or for drawings.")] = YoloPresetName.PRIM,
+    preset: Annotated[
+        YoloPresetName, typer.Option(help="Ours, the paper's settings, or one for drawings.")
+    ] = YoloPresetName.PRIM,
     epochs: Annotated[
         int | None, typer.Option(metavar="N", help="Passes over the set. [default: the preset's]")
     ] = None,
@@ -210,13 +216,20 @@ class StageName(StrEnum):
     CNN = "cnn"
 
 
+class StyleName(StrEnum):
+    """How cells are shown."""
+
+    GREY = "grey"
+    ROUNDED = "rounded"
+
+
 @train.command()
 def export(
     weights: Annotated[Path, typer.Argument(metavar="W.pt", help="What prim-train yolo or prim-train cnn has left.")],
     output: Annotated[Path, typer.Argument(metavar="OUT.onnx", help="The file to make.")],
     stage: Annotated[StageName, typer.Option(help="What the weights are of.")],
     mapper: Annotated[MapperName, typer.Option(help="Whose maps they were trained on.")] = MapperName.FORWARD,
-    image_size: Annotated[int, typer.Option(metavar="PX", help="The side of YOLO's images.")] = 224,
+    style: Annotated[StyleName, typer.Option(help="How cells were shown.")] = StyleName.GREY,
     trust: Annotated[bool, typer.Option("--trust", help="YOLO's .pt is a pickle that can run code: run it.")] = False,
     debug: Annotated[bool, typer.Option("--debug", help="Show tracebacks.")] = False,
 ) -> int:
@@ -225,9 +238,9 @@ def export(
     from detect.export import export_cnn, export_yolo
 
     if stage is StageName.CNN:
-        export_cnn(weights, mapper.value, output)
+        export_cnn(weights, mapper.value, output, style.value)
     else:
-        export_yolo(weights, mapper.value, output, image_size, trust)
+        export_yolo(weights, mapper.value, output, trust, style.value)
     typer.echo(f"wrote: {output}")
     return 0
 

@@ -101,9 +101,7 @@ def draw(rng: np.random.Generator) -> tuple[NDArray[np.uint8], list[Primitive]]:
     known = _known(primitives, room, rng) | (probability > 0.5)
     probability = np.where(known, probability, 0.5)
     if rng.random() < 0.5:
-        grey = np.select(
-            (probability > 0.5, probability < 0.5), (np.uint8(255), np.uint8(0)), np.uint8(UNKNOWN_GREY)
-        )
+        grey = np.select((probability > 0.5, probability < 0.5), (np.uint8(255), np.uint8(0)), np.uint8(UNKNOWN_GREY))
         return np.repeat(grey[..., None], 3, axis=2), primitives
     shown = np.where(known, np.uint8(255), np.uint8(0))
     evidence = (shown * rng.uniform(0.3, 1.0)).astype(np.uint8)

@@ -13,6 +13,7 @@ import torch
 
 from detect.networks import ParameterNetwork
 from detect.parameters import PRESETS
+from detect.tiles import TILE
 from detect.weights import CARD_KEY, Card
 from prim.errors import UsageError
 from prim.shapes import Kind
@@ -20,7 +21,9 @@ from prim.shapes import Kind
 OPSET = 17
 
 
-def export_cnn(checkpoint: Path, mapper: str, output: Path, about: Mapping[str, Any] | None = None) -> Card:
+def export_cnn(
+    checkpoint: Path, mapper: str, output: Path, style: str = "grey", about: Mapping[str, Any] | None = None
+) -> Card:
     """Makes an ONNX file of a checkpoint of ``prim-train cnn``; crops (N, channels, pixels, pixels), outputs (N, M).
 
     Raises UsageError on a file that is no such checkpoint; nothing in it is run.
@@ -28,7 +31,8 @@ def export_cnn(checkpoint: Path, mapper: str, output: Path, about: Mapping[str, 
     network = _read_checkpoint(checkpoint)
     network.eval()
     pixels = network.preset.pixels
-    card = Card("cnn", mapper, network.kind.value, network.preset.name, network.channels, dict(about or {}))
+    kinds = tuple(kind.value for kind in network.kinds)
+    card = Card("cnn", mapper, kinds, network.preset.name, network.channels, style, about=dict(about or {}))
     torch.onnx.export(
         network,
         (torch.zeros(2, network.channels, pixels, pixels),),
@@ -47,7 +51,8 @@ def _read_checkpoint(path: Path) -> ParameterNetwork:
     try:
         state = torch.load(path, weights_only=True)
         options = state["options"]
-        network = ParameterNetwork(Kind(state["kind"]), PRESETS[options["preset"]], options["channels"])
+        kinds = [Kind(kind) for kind in state["kinds"]]
+        network = ParameterNetwork(kinds, PRESETS[options["preset"]], options["channels"])
         network.load_state_dict(state["network"])
     except Exception as error:  # torch raises many kinds on files that are none of its own
         raise UsageError(f"{path} is no checkpoint of prim-train cnn") from error
@@ -55,7 +60,12 @@ def _read_checkpoint(path: Path) -> ParameterNetwork:
 
 
 def export_yolo(
-    weights: Path, mapper: str, output: Path, image_size: int, trust: bool, about: Mapping[str, Any] | None = None
+    weights: Path,
+    mapper: str,
+    output: Path,
+    trust: bool,
+    style: str = "grey",
+    about: Mapping[str, Any] | None = None,
 ) -> Card:
     """Makes an ONNX file of YOLO weights: images (N, 3, rows, cols), boxes and scores (N, 4 + kinds, anchors).
 
@@ -71,9 +81,9 @@ def export_yolo(
     with tempfile.TemporaryDirectory() as folder:
         copy = Path(folder) / weights.name
         shutil.copy(weights, copy)
-        made = YOLO(str(copy)).export(format="onnx", imgsz=image_size, dynamic=True, opset=OPSET, verbose=False)
+        made = YOLO(str(copy)).export(format="onnx", imgsz=TILE, dynamic=True, opset=OPSET, verbose=False)
         shutil.move(made, output)
-    card = Card("yolo", mapper, None, None, 3, {"image_size": image_size} | dict(about or {}))
+    card = Card("yolo", mapper, style=style, about=dict(about or {}))
     write_card(output, card)
     return card
 

@@ -3,22 +3,22 @@
 Two ways of doing it, one for each preset:
 
 - ``paper`` (III-C): the box is cut out and put in the middle of an empty canvas of 200 x 200 cells, which is shrunk
-  to 50 x 50; the outputs are the parameters themselves.
+  to 50 x 50; the outputs are the parameters themselves, and the primitive lies where its box does.
 - ``prim``: a window of 72 x 72 cells around the box's centre, at the map's own resolution, with what lies around the
   primitive left in; an angle is two outputs, the cosine and the sine of the angle times the kind's symmetry, so that
-  no angle is torn apart where it wraps around.
+  no angle is torn apart where it wraps around; two more say how far the centroid lies from the window's middle.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from mapping.grid import UNKNOWN_GREY
+from mapping.grid import UNKNOWN_GREY, GridFrame
 from prim.shapes import Kind, Primitive
 
 Box = tuple[float, float, float, float]
@@ -39,7 +39,7 @@ class Preset:
     """How crops are made and outputs are read.
 
     ``window`` cells around the box's centre become ``pixels`` x ``pixels``; ``isolated`` leaves only the box in it;
-    ``vector`` makes two outputs of an angle.
+    ``vector`` makes two outputs of an angle; ``offset`` adds two outputs for where the centroid lies.
     """
 
     name: str
@@ -47,15 +47,35 @@ class Preset:
     pixels: int
     isolated: bool
     vector: bool
+    offset: bool
+
+    def angles(self, kind: Kind) -> int:
+        """How many of a kind's outputs tell its angle: they come first."""
+        return 0 if kind not in TURNS else 2 if self.vector else 1
 
     def outputs(self, kind: Kind) -> int:
-        """How many numbers the kind's network gives."""
-        angle = 0 if kind not in TURNS else 2 if self.vector else 1
-        return angle + SIZES[kind]
+        """How many numbers tell a kind's parameters: angle, offset, sizes."""
+        return self.angles(kind) + 2 * self.offset + SIZES[kind]
+
+    def span(self, kinds: Sequence[Kind], kind: Kind) -> slice:
+        """Which outputs of a network for several ``kinds`` are one kind's."""
+        first = sum(self.outputs(other) for other in kinds[: kinds.index(kind)])
+        return slice(first, first + self.outputs(kind))
+
+    def corner(self, box: Box) -> tuple[int, int]:
+        """Column and row of the first cell of the window around a box."""
+        left, top, right, bottom = box
+        return round((left + right - self.window) / 2), round((top + bottom - self.window) / 2)
+
+    def centre(self, box: Box, tile: GridFrame) -> tuple[float, float]:
+        """Where (m) the middle of the window around a box of a tile lies."""
+        col, row = self.corner(box)
+        half = self.window / 2
+        return (tile.col + col + half) * tile.resolution, (tile.row + row + half) * tile.resolution
 
 
-PAPER = Preset("paper", 200, 50, isolated=True, vector=False)
-PRIM = Preset("prim", 72, 72, isolated=False, vector=True)
+PAPER = Preset("paper", 200, 50, isolated=True, vector=False, offset=False)
+PRIM = Preset("prim", 72, 72, isolated=False, vector=True, offset=True)
 PRESETS = {preset.name: preset for preset in (PAPER, PRIM)}
 
 
@@ -63,7 +83,7 @@ def crop(image: NDArray[np.uint8], box: Box, preset: Preset) -> NDArray[np.uint8
     """The part (pixels, pixels) of a grey image (rows, cols) that a network sees; unknown beyond the image."""
     rows, cols = image.shape
     left, top, right, bottom = box
-    col, row = round((left + right) / 2 - preset.window / 2), round((top + bottom) / 2 - preset.window / 2)
+    col, row = preset.corner(box)
     window = np.full((preset.window, preset.window), UNKNOWN_GREY, np.uint8)
     first_col, last_col, first_row, last_row = col, col + preset.window, row, row + preset.window
     if preset.isolated:
@@ -87,35 +107,38 @@ def shrink(window: NDArray[np.uint8], pixels: int) -> NDArray[np.uint8]:
 
 
 def targets(primitive: Primitive, preset: Preset) -> NDArray[np.float32]:
-    """What a network should give for a primitive: its angle's outputs, then its sizes in units of LONGEST."""
+    """What a network should give for a primitive, whose place (m) is given from the middle of its crop's window."""
     values: list[float] = []
     turns = TURNS.get(primitive.kind)
     if turns is not None:
         theta = primitive.theta or 0.0
         period = 2 * math.pi / turns
         values = [math.cos(turns * theta), math.sin(turns * theta)] if preset.vector else [theta % period / period]
+    if preset.offset:
+        values += [primitive.x / LONGEST, primitive.y / LONGEST]
     return np.array([*values, *(size / LONGEST for size in primitive.size)], dtype=np.float32)
 
 
-def read_outputs(kind: Kind, outputs: Sequence[float], preset: Preset) -> tuple[float | None, tuple[float, ...]]:
-    """Angle (rad, None for a circle) and sizes (m, at least a millimetre) from a network's outputs."""
+def read_outputs(kind: Kind, outputs: Sequence[float], preset: Preset, box: Box, tile: GridFrame) -> Primitive:
+    """The primitive in a box of a tile that a kind's outputs tell; sizes are a millimetre at least.
+
+    Where the outputs tell no offset, its outline's box has its middle where ``box`` has it: a triangle's centroid,
+    for one, is not there.
+    """
+    first = preset.angles(kind)
     turns = TURNS.get(kind)
     theta = None
     if turns is not None:
         period = 2 * math.pi / turns
-        turned = math.atan2(outputs[1], outputs[0]) / turns if preset.vector else outputs[0] * period
-        theta = turned % period
-    sizes = outputs[preset.outputs(kind) - SIZES[kind] : preset.outputs(kind)]
-    return theta, tuple(max(float(size) * LONGEST, 0.001) for size in sizes)
-
-
-def placed(kind: Kind, box_centre: tuple[float, float], theta: float | None, size: tuple[float, ...]) -> Primitive:
-    """The primitive whose outline's box has its centre (m) where the detected box has it.
-
-    A triangle's centroid, for one, is not the middle of its box.
-    """
+        theta = math.atan2(outputs[1], outputs[0]) / turns if preset.vector else outputs[0] * period
+    size = tuple(max(float(value) * LONGEST, 0.001) for value in outputs[preset.outputs(kind) - SIZES[kind] :])
+    if preset.offset:
+        x, y = preset.centre(box, tile)
+        x, y = x + outputs[first] * LONGEST, y + outputs[first + 1] * LONGEST
+        return Primitive(kind, float(x), float(y), theta, size).canonical()
+    left, top, right, bottom = box
+    x, y = (tile.col + (left + right) / 2) * tile.resolution, (tile.row + (top + bottom) / 2) * tile.resolution
     at_origin = Primitive(kind, 0.0, 0.0, theta, size).canonical()
     outline = at_origin.outline()
     middle = (outline.min(axis=0) + outline.max(axis=0)) / 2
-    x, y = box_centre[0] - float(middle[0]), box_centre[1] - float(middle[1])
-    return Primitive(at_origin.kind, x, y, at_origin.theta, at_origin.size)
+    return replace(at_origin, x=float(x - middle[0]), y=float(y - middle[1]))

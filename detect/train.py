@@ -6,7 +6,7 @@ Needs the extra ``[train]`` (torch, ultralytics). Nothing that replays imports t
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -18,9 +18,12 @@ import torch
 from detect.crops import Crops, gather
 from detect.dataset import samples
 from detect.networks import ParameterNetwork
-from detect.parameters import PAPER, PRESETS, PRIM
+from detect.parameters import PAPER, PRESETS, PRIM, targets
 from prim.errors import UsageError
-from prim.shapes import Kind
+from prim.shapes import Kind, Primitive
+
+HUBER = 0.1
+LENGTH_WEIGHT = 10.0
 
 FINISHED = "finished"
 """A file of this name says that a run of YOLO's training has come to its end."""
@@ -54,19 +57,33 @@ CNN_PRESETS = {PRIM.name: CnnOptions(), PAPER.name: CnnOptions(PAPER.name, epoch
 """Ours; and the paper's (IV-B: 20 epochs, batch 128, Adam, learning rate 0.001, the crops as they are)."""
 
 
-def train_cnn(
-    data: Path, mapper: str, kind: Kind, output: Path, options: CnnOptions, progress: Progress | None = None
-) -> ParameterNetwork:
-    """Trains one kind's network on a set, and keeps a checkpoint at ``output`` after each epoch; goes on from one.
+def networks_of(preset: str, kinds: Sequence[Kind]) -> list[tuple[Kind, ...]]:
+    """The kinds of each network that a preset trains: the paper's one each, ours one for all."""
+    return [(kind,) for kind in kinds] if preset == PAPER.name else [tuple(kinds)]
 
-    The loss is the mean squared error of the outputs. Raises UsageError where the set holds no primitive of the kind,
-    or the checkpoint is one of other options.
+
+def checkpoint_name(mapper: str, kinds: Sequence[Kind]) -> str:
+    """What the checkpoint of a network for some kinds is called."""
+    return ".".join(["cnn", mapper, *([] if len(kinds) == len(Kind) else ["-".join(kinds)]), "pt"])
+
+
+def train_cnn(
+    data: Path,
+    mapper: str,
+    kinds: Sequence[Kind],
+    output: Path,
+    options: CnnOptions,
+    progress: Progress | None = None,
+) -> ParameterNetwork:
+    """Trains a network for some kinds on a set; keeps a checkpoint at ``output`` after each epoch, goes on from one.
+
+    Raises UsageError where the set holds no primitive of these kinds, or the checkpoint is one of other options.
     """
     torch.manual_seed(options.seed)
-    training, validation = (gather(samples(data, mapper, split), kind) for split in ("train", "val"))
+    training, validation = (gather(samples(data, mapper, split), kinds) for split in ("train", "val"))
     if not len(training):
-        raise UsageError(f"{data} holds no {kind} to learn from")
-    network = ParameterNetwork(kind, PRESETS[options.preset], options.channels)
+        raise UsageError(f"{data} holds no {' or '.join(kinds)} to learn from")
+    network = ParameterNetwork(kinds, PRESETS[options.preset], options.channels)
     optimizer = torch.optim.Adam(network.parameters(), lr=options.learning_rate)
     schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, options.epochs)
     first = _resume(output, options, network, optimizer, schedule)
@@ -98,7 +115,9 @@ def _epoch(
         if len(chosen) < 2:  # batch normalisation needs two
             continue
         pairs = [crops.varied(i, preset, rng) if options.vary else crops.exact(i, preset) for i in chosen.tolist()]
-        loss = torch.nn.functional.mse_loss(network(as_input(pairs, network.channels)), _wanted(pairs))
+        with fast_arithmetic():
+            outputs = network(as_input(pairs, network.channels))
+        loss = _loss(network, outputs.float(), [primitive for _, primitive in pairs])
         optimizer.zero_grad()
         loss.backward()
         optimizer.step()
@@ -114,18 +133,37 @@ def evaluate_cnn(network: ParameterNetwork, crops: Crops, batch: int = 256) -> f
         for begin in range(0, len(crops), batch):
             pairs = [crops.exact(i, network.preset) for i in range(begin, min(begin + batch, len(crops)))]
             outputs = network(as_input(pairs, network.channels))
-            total += float(torch.nn.functional.mse_loss(outputs, _wanted(pairs))) * len(pairs)
+            total += float(_loss(network, outputs, [primitive for _, primitive in pairs])) * len(pairs)
     return total / max(len(crops), 1)
 
 
-def as_input(pairs: list[tuple[Any, Any]], channels: int) -> torch.Tensor:
+def _loss(network: ParameterNetwork, outputs: torch.Tensor, primitives: Sequence[Primitive]) -> torch.Tensor:
+    """How far outputs (N, M) are from the primitives' own, each at its kind's outputs alone.
+
+    The paper's preset: the mean squared error. Ours: Huber's, quadratic up to HUBER; sizes and offsets, whose unit is
+    as large as the largest primitive, count LENGTH_WEIGHT times.
+    """
+    preset = network.preset
+    wanted = np.zeros(tuple(outputs.shape), np.float32)
+    weight = np.zeros_like(wanted)
+    for row, primitive in enumerate(primitives):
+        span = preset.span(network.kinds, primitive.kind)
+        wanted[row, span] = targets(primitive, preset)
+        weight[row, span] = 1.0 / preset.outputs(primitive.kind)
+        if preset.vector:
+            weight[row, span.start + preset.angles(primitive.kind) : span.stop] *= LENGTH_WEIGHT
+    goal = torch.from_numpy(wanted)
+    if preset.vector:
+        errors = torch.nn.functional.huber_loss(outputs, goal, reduction="none", delta=HUBER)
+    else:
+        errors = torch.nn.functional.mse_loss(outputs, goal, reduction="none")
+    return (errors * torch.from_numpy(weight)).sum() / len(primitives)
+
+
+def as_input(pairs: Sequence[tuple[Any, Any]], channels: int) -> torch.Tensor:
     """Crops as the network takes them: (N, channels, pixels, pixels) in 0 to 1."""
     grey = torch.from_numpy(np.stack([made for made, _ in pairs])).float().div_(255).unsqueeze(1)
     return grey.expand(-1, channels, -1, -1)
-
-
-def _wanted(pairs: list[tuple[Any, Any]]) -> torch.Tensor:
-    return torch.from_numpy(np.stack([wanted for _, wanted in pairs]))
 
 
 def _keep(output: Path, options: CnnOptions, network: Any, optimizer: Any, schedule: Any, epochs: int) -> None:
@@ -133,7 +171,7 @@ def _keep(output: Path, options: CnnOptions, network: Any, optimizer: Any, sched
     part = output.with_suffix(".part")
     state = {
         "options": asdict(options),
-        "kind": network.kind.value,
+        "kinds": [kind.value for kind in network.kinds],
         "epochs": epochs,
         "network": network.state_dict(),
         "optimizer": optimizer.state_dict(),
@@ -148,7 +186,7 @@ def _resume(output: Path, options: CnnOptions, network: Any, optimizer: Any, sch
     if not output.exists():
         return 0
     state = torch.load(output, weights_only=True)
-    if state["options"] != asdict(options) or state["kind"] != network.kind.value:
+    if state["options"] != asdict(options) or state["kinds"] != [kind.value for kind in network.kinds]:
         raise UsageError(f"{output} was trained with other options: give another file")
     network.load_state_dict(state["network"])
     optimizer.load_state_dict(state["optimizer"])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -22,7 +23,7 @@ BoxArray = NDArray[np.float32]
 
 @dataclass(frozen=True)
 class Boxes:
-    """Candidates of one image: ``box`` (N, 4), ``kind`` (N,) as an index of KINDS, ``score`` (N,), best first."""
+    """Candidates of one image: ``box`` (N, 4), ``kind`` (N,) as an index of KINDS, ``score`` (N,)."""
 
     box: BoxArray
     kind: NDArray[np.intp]
@@ -33,6 +34,18 @@ class Boxes:
 
     def __getitem__(self, chosen: NDArray[np.bool_] | NDArray[np.intp]) -> Boxes:
         return Boxes(self.box[chosen], self.kind[chosen], self.score[chosen])
+
+    def moved(self, cols: int, rows: int) -> Boxes:
+        """The same, moved by whole cells."""
+        return Boxes(self.box + np.array([cols, rows, cols, rows], np.float32), self.kind, self.score)
+
+    @classmethod
+    def joined(cls, parts: Sequence[Boxes]) -> Boxes:
+        """All parts, one after the other."""
+        if not parts:
+            return cls(np.empty((0, 4), np.float32), np.empty(0, np.intp), np.empty(0, np.float32))
+        box, kind, score = ([getattr(part, name) for part in parts] for name in ("box", "kind", "score"))
+        return cls(np.concatenate(box), np.concatenate(kind), np.concatenate(score))
 
 
 class Yolo:
@@ -75,10 +88,8 @@ def _candidates(output: NDArray[np.float32], floor: float, every_kind: bool) -> 
         anchor = np.flatnonzero(scores[best, np.arange(scores.shape[1])] >= floor)
         kind = best[anchor]
     score = scores[kind, anchor]
-    order = np.argsort(-score, kind="stable")
-    kind, anchor = kind[order], anchor[order]
     centre, half = output[0:2, anchor].T, output[2:4, anchor].T / 2
-    return Boxes(np.concatenate((centre - half, centre + half), axis=1), kind, score[order])
+    return Boxes(np.concatenate((centre - half, centre + half), axis=1), kind, score)
 
 
 def overlap(box: BoxArray, others: BoxArray) -> NDArray[np.float32]:
@@ -89,19 +100,24 @@ def overlap(box: BoxArray, others: BoxArray) -> NDArray[np.float32]:
     return np.asarray(shared / np.maximum((box[2:] - box[:2]).prod() + areas - shared, 1e-9), dtype=np.float32)
 
 
-def suppress(boxes: Boxes, limit: float, per_kind: bool = False) -> NDArray[np.intp]:
+def suppress(
+    boxes: Boxes, limit: float, per_kind: bool = False, among: NDArray[np.bool_] | None = None
+) -> NDArray[np.intp]:
     """By which better candidate each is suppressed (N,): its index; its own where it stays.
 
     Greedy, best first: what overlaps a better one by more than ``limit`` (IoU) goes; with ``per_kind`` only where
-    both are of one kind.
+    both are of one kind. Candidates that are not ``among`` take no part, and have -1.
     """
     by = np.full(len(boxes), -1, np.intp)
-    for i in range(len(boxes)):
-        if by[i] >= 0:
-            continue
-        by[i] = i
-        rest = np.flatnonzero(by < 0)
+    order = np.argsort(-boxes.score, kind="stable")
+    if among is not None:
+        order = order[among[order]]
+    while len(order):
+        best, rest = order[0], order[1:]
+        by[best] = best
+        gone = overlap(boxes.box[best], boxes.box[rest]) > limit
         if per_kind:
-            rest = rest[boxes.kind[rest] == boxes.kind[i]]
-        by[rest[overlap(boxes.box[i], boxes.box[rest]) > limit]] = i
+            gone &= boxes.kind[rest] == boxes.kind[best]
+        by[rest[gone]] = best
+        order = rest[~gone]
     return by

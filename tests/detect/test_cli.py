@@ -63,10 +63,11 @@ def test_weights_that_can_run_code_must_be_trusted(run: Run) -> None:
 def test_a_network_learns_and_goes_on(run: Run) -> None:
     pytest.importorskip("torch", reason="needs the extra [train]")
     run("dataset", "set", "--maps", 6, 2, "--mapper", "prob", "--kind", "circle", "--noise-std", 0.0)
-    code, out, _ = run("cnn", "set", "out", "--mapper", "prob", "--kind", "circle", "--epochs", 4)
+    options = ("--mapper", "prob", "--kind", "circle", "--epochs")
+    code, out, _ = run("cnn", "set", "out", *options, 12)
     losses = [float(line.split("loss ")[1].split(",")[0]) for line in out.splitlines()]
-    assert code == 0 and len(losses) == 4 and losses[-1] < losses[0]
+    assert code == 0 and len(losses) == 12 and losses[-1] < losses[0]
     assert (Path("out") / "cnn.prob.circle.pt").exists()
-    assert run("cnn", "set", "out", "--mapper", "prob", "--kind", "circle", "--epochs", 4)[1] == ""
-    code, _, err = run("cnn", "set", "out", "--mapper", "prob", "--kind", "circle", "--epochs", 5)
+    assert run("cnn", "set", "out", *options, 12)[1] == ""
+    code, _, err = run("cnn", "set", "out", *options, 13)
     assert code == 2 and "other options" in err

@@ -34,7 +34,7 @@ def test_a_missing_file_and_a_folder(tmp_path: Path) -> None:
 
 
 def test_a_card_reads_back() -> None:
-    card = Card("cnn", "prob", "circle", "prim", 1, {"seed": 3})
+    card = Card("cnn", "prob", ("circle",), "prim", 1, about={"seed": 3})
     assert Card.from_json(card.to_json()) == card
     for text in ("null", "{}", '{"schema": "prim-weights/1"}', '{"schema": "prim-weights/1", "magic": 1}', "[1]"):
         with pytest.raises(ValueError, match=r"."):
@@ -55,13 +55,13 @@ def test_an_exported_network_gives_torch_s_numbers(tmp_path: Path, preset: str, 
     from prim.shapes import Kind
 
     torch.manual_seed(1)
-    network = ParameterNetwork(Kind(kind), PRESETS[preset])
+    network = ParameterNetwork([Kind(kind)], PRESETS[preset])
     network.eval()
-    state = {"options": asdict(CnnOptions(preset)), "kind": kind, "network": network.state_dict()}
+    state = {"options": asdict(CnnOptions(preset)), "kinds": [kind], "network": network.state_dict()}
     torch.save(state, tmp_path / "a.pt")
     export_cnn(tmp_path / "a.pt", "forward", tmp_path / "a.onnx")
     weights = load_weights(tmp_path / "a.onnx", "cnn", "forward")
-    assert (weights.card.kind, weights.card.preset) == (kind, preset)
+    assert (weights.card.kinds, weights.card.preset) == ((kind,), preset)
     crops = np.random.default_rng(0).random((5, 1, *[PRESETS[preset].pixels] * 2), dtype=np.float32)
     outputs = weights.session.run(None, {"crops": crops})[0]
     with torch.no_grad():
@@ -82,4 +82,4 @@ def test_what_is_no_checkpoint_is_not_exported(tmp_path: Path) -> None:
     with pytest.raises(UsageError, match="no checkpoint"):
         export_cnn(path, "det", tmp_path / "a.onnx")
     with pytest.raises(UsageError, match="--trust"):
-        export_yolo(path, "det", tmp_path / "a.onnx", 224, trust=False)
+        export_yolo(path, "det", tmp_path / "a.onnx", trust=False)

@@ -1,0 +1,171 @@
+"""From a map to primitives: tiles, boxes, crops, parameters (the paper's III-C), on ONNX Runtime."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from itertools import islice
+from pathlib import Path
+from typing import TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from detect.estimator import Estimator, Found
+from detect.tiles import TILE, cut, tiles, window
+from detect.weights import Weights, load_set
+from detect.yolo import KINDS, Boxes, Yolo, suppress
+from mapping.grid import GridFrame, OccupancyGrid
+from prim.errors import UsageError
+from prim.shapes import Kind, Primitive
+
+FLOOR = 0.05
+"""What YOLO gives a lower score than this is no candidate."""
+
+DEFAULT_THRESHOLD = 0.25
+"""The least score of a kind whose card names none: YOLOv5's own."""
+
+OVERLAP_LIMIT = 0.45
+"""Of two candidates that overlap by more than this (IoU), the better stays: YOLOv5's own."""
+
+EDGE = 2
+"""A box that comes this near (cells) to a tile's border, where the map goes on, is left to the next tile."""
+
+BATCH = 8
+"""Tiles that go through the network at once: what bounds memory."""
+
+
+@dataclass(frozen=True)
+class Detection:
+    """A primitive with its ``score`` (0 to 1) and the ``crop`` (pixels, pixels) its parameters were read from."""
+
+    primitive: Primitive
+    score: float
+    crop: NDArray[np.uint8]
+
+
+@dataclass(frozen=True)
+class Rejection:
+    """A candidate that is no detection: kind, score, where its box has its middle (m), and by which threshold."""
+
+    kind: Kind
+    score: float
+    x: float
+    y: float
+    reason: str
+
+
+@dataclass(frozen=True)
+class Detections:
+    """What was found in a map, best first, and what was not taken for a primitive."""
+
+    found: tuple[Detection, ...]
+    rejected: tuple[Rejection, ...]
+
+
+Scored = TypeVar("Scored", Detection, Rejection)
+
+
+class Detector:
+    """Finds primitives in maps of one mapper; see :meth:`load`."""
+
+    def __init__(self, yolo: Weights, networks: Sequence[Weights]) -> None:
+        """Raises WeightsError where a network is not what its card says."""
+        self.card = yolo.card
+        self.yolo = Yolo(yolo)
+        self.estimator = Estimator(networks)
+        self.thresholds = {kind: float(yolo.card.thresholds.get(kind, DEFAULT_THRESHOLD)) for kind in KINDS}
+
+    @classmethod
+    def load(cls, path: Path, mapper: str | None = None, threads: int | None = None) -> Detector:
+        """A detector from a folder of weights, or YOLO's file in it. Raises WeightsError on what cannot be used."""
+        return cls(*load_set(path, mapper, threads))
+
+    def detect(self, grid: OccupancyGrid) -> Detections:
+        """The primitives in a map.
+
+        Raises UsageError on a map of another resolution than the networks were trained on.
+        """
+        if not np.isclose(grid.frame.resolution, self.card.resolution, rtol=1e-6):
+            wanted, got = self.card.resolution, grid.frame.resolution
+            raise UsageError(f"the detector reads maps with cells of {wanted:g} m, not {got:g} m")
+        looked = list(self._look(grid))
+        boxes = Boxes.joined([seen for _, seen in looked])
+        tile = [tile for tile, seen in looked for _ in range(len(seen))]
+        whole = np.array(
+            [_is_whole(box, of, grid.frame) for box, of in zip(boxes.box, tile, strict=True)], dtype=bool
+        )
+        better = suppress(boxes, OVERLAP_LIMIT, among=whole)
+        reasons = [self._reason(boxes, i, by) for i, by in enumerate(better.tolist())]
+        kept = [i for i, reason in enumerate(reasons) if reason is None]
+        found = [self._found(grid, tile[i], boxes, i) for i in kept]
+        detections = (
+            Detection(primitive, float(boxes.score[i]), self.estimator.crop(one))
+            for i, one, primitive in zip(kept, found, self.estimator(found), strict=True)
+        )
+        rejections = (
+            _rejection(boxes, i, grid.frame.resolution, reason) for i, reason in enumerate(reasons) if reason
+        )
+        return Detections(
+            tuple(sorted(detections, key=lambda one: -one.score)),
+            tuple(sorted(rejections, key=lambda one: -one.score)),
+        )
+
+    def _look(self, grid: OccupancyGrid) -> Iterator[tuple[GridFrame, Boxes]]:
+        """The tiles that hold anything, with what YOLO sees in them, in the plane's cells."""
+        for batch in _batches(_worth_a_look(grid)):
+            images = np.stack([cut(grid, tile, self.card.style) for tile in batch])
+            for tile, seen in zip(batch, self.yolo(images, FLOOR), strict=True):
+                yield tile, seen.moved(tile.col, tile.row)
+
+    def _reason(self, boxes: Boxes, i: int, by: int) -> str | None:
+        """Why a candidate is no detection; None where it is one."""
+        kind, score = KINDS[boxes.kind[i]], float(boxes.score[i])
+        if by < 0:
+            return f"within {EDGE} cells of its tile's border: the next tile holds it whole"
+        if by != i:
+            return f"overlaps a better {KINDS[boxes.kind[by]]} by more than {OVERLAP_LIMIT:g} (IoU)"
+        if score < self.thresholds[kind]:
+            return f"score {score:.2f} is below {self.thresholds[kind]:.2f}, the least for a {kind}"
+        return None
+
+    def _found(self, grid: OccupancyGrid, tile: GridFrame, boxes: Boxes, i: int) -> Found:
+        """A candidate as the estimator takes it."""
+        left, top, right, bottom = boxes.moved(-tile.col, -tile.row).box[i].tolist()
+        grey = np.ascontiguousarray(cut(grid, tile, self.card.style)[..., 0])
+        return Found(grey, tile, (left, top, right, bottom), KINDS[boxes.kind[i]])
+
+
+def _best_first(of: Iterable[Scored]) -> tuple[Scored, ...]:
+    return tuple(sorted(of, key=lambda one: -one.score))
+
+
+def _worth_a_look(grid: OccupancyGrid) -> Iterator[GridFrame]:
+    """The tiles with anything occupied in them."""
+    for tile in tiles(grid.frame):
+        part = window(grid, tile)
+        if part is not None and part.occupied.any():
+            yield tile
+
+
+def _batches(of: Iterator[GridFrame]) -> Iterator[list[GridFrame]]:
+    while batch := list(islice(of, BATCH)):
+        yield batch
+
+
+def _is_whole(box: NDArray[np.float32], tile: GridFrame, frame: GridFrame) -> bool:
+    """Whether a box (plane's cells) keeps off those borders of its tile beyond which the map goes on."""
+    left, top, right, bottom = box.tolist()
+    cut_off = (
+        frame.col < tile.col and left < tile.col + EDGE,
+        frame.row < tile.row and top < tile.row + EDGE,
+        frame.col + frame.cols > tile.col + TILE and right > tile.col + TILE - EDGE,
+        frame.row + frame.rows > tile.row + TILE and bottom > tile.row + TILE - EDGE,
+    )
+    return not any(cut_off)
+
+
+def _rejection(boxes: Boxes, i: int, resolution: float, reason: str) -> Rejection:
+    left, top, right, bottom = (float(value) for value in boxes.box[i])
+    x, y = (left + right) / 2 * resolution, (top + bottom) / 2 * resolution
+    return Rejection(KINDS[boxes.kind[i]], float(boxes.score[i]), x, y, reason)
