@@ -63,6 +63,16 @@ class Detections:
     rejected: tuple[Rejection, ...]
 
 
+@dataclass(frozen=True)
+class _Looked:
+    """A tile, its grey image (TILE, TILE), and the candidates in it, in the plane's cells."""
+
+    tile: GridFrame
+    grey: NDArray[np.uint8]
+    boxes: Boxes
+
+
+Item = TypeVar("Item")
 Scored = TypeVar("Scored", Detection, Rejection)
 
 
@@ -89,34 +99,35 @@ class Detector:
         if not np.isclose(grid.frame.resolution, self.card.resolution, rtol=1e-6):
             wanted, got = self.card.resolution, grid.frame.resolution
             raise UsageError(f"the detector reads maps with cells of {wanted:g} m, not {got:g} m")
-        looked = list(self._look(grid))
-        boxes = Boxes.joined([seen for _, seen in looked])
-        tile = [tile for tile, seen in looked for _ in range(len(seen))]
-        whole = np.array(
-            [_is_whole(box, of, grid.frame) for box, of in zip(boxes.box, tile, strict=True)], dtype=bool
+        return self.detect_images(
+            ((tile, cut(grid, tile, self.card.style)) for tile in _worth_a_look(grid)), grid.frame
         )
-        better = suppress(boxes, OVERLAP_LIMIT, among=whole)
+
+    def detect_images(self, images: Iterable[tuple[GridFrame, NDArray[np.uint8]]], frame: GridFrame) -> Detections:
+        """The primitives in a map that is given as its tiles' images (TILE, TILE, 3); ``frame`` is the map's."""
+        looked = list(self._look(images))
+        boxes = Boxes.joined([one.boxes for one in looked])
+        of = [one for one in looked for _ in range(len(one.boxes))]
+        whole = [_is_whole(box, one.tile, frame) for box, one in zip(boxes.box, of, strict=True)]
+        better = suppress(boxes, OVERLAP_LIMIT, among=np.array(whole, dtype=bool))
         reasons = [self._reason(boxes, i, by) for i, by in enumerate(better.tolist())]
         kept = [i for i, reason in enumerate(reasons) if reason is None]
-        found = [self._found(grid, tile[i], boxes, i) for i in kept]
+        found = [_found(of[i], boxes, i) for i in kept]
         detections = (
             Detection(primitive, float(boxes.score[i]), self.estimator.crop(one))
             for i, one, primitive in zip(kept, found, self.estimator(found), strict=True)
         )
-        rejections = (
-            _rejection(boxes, i, grid.frame.resolution, reason) for i, reason in enumerate(reasons) if reason
-        )
-        return Detections(
-            tuple(sorted(detections, key=lambda one: -one.score)),
-            tuple(sorted(rejections, key=lambda one: -one.score)),
-        )
+        rejections = (_rejection(boxes, i, frame.resolution, reason) for i, reason in enumerate(reasons) if reason)
+        return Detections(_best_first(detections), _best_first(rejections))
 
-    def _look(self, grid: OccupancyGrid) -> Iterator[tuple[GridFrame, Boxes]]:
-        """The tiles that hold anything, with what YOLO sees in them, in the plane's cells."""
-        for batch in _batches(_worth_a_look(grid)):
-            images = np.stack([cut(grid, tile, self.card.style) for tile in batch])
-            for tile, seen in zip(batch, self.yolo(images, FLOOR), strict=True):
-                yield tile, seen.moved(tile.col, tile.row)
+    def _look(self, images: Iterable[tuple[GridFrame, NDArray[np.uint8]]]) -> Iterator[_Looked]:
+        """What YOLO sees in tiles, where it sees anything."""
+        for batch in _batches(iter(images)):
+            for (tile, image), seen in zip(
+                batch, self.yolo(np.stack([image for _, image in batch]), FLOOR), strict=True
+            ):
+                if len(seen):
+                    yield _Looked(tile, np.ascontiguousarray(image[..., 0]), seen.moved(tile.col, tile.row))
 
     def _reason(self, boxes: Boxes, i: int, by: int) -> str | None:
         """Why a candidate is no detection; None where it is one."""
@@ -129,11 +140,13 @@ class Detector:
             return f"score {score:.2f} is below {self.thresholds[kind]:.2f}, the least for a {kind}"
         return None
 
-    def _found(self, grid: OccupancyGrid, tile: GridFrame, boxes: Boxes, i: int) -> Found:
-        """A candidate as the estimator takes it."""
-        left, top, right, bottom = boxes.moved(-tile.col, -tile.row).box[i].tolist()
-        grey = np.ascontiguousarray(cut(grid, tile, self.card.style)[..., 0])
-        return Found(grey, tile, (left, top, right, bottom), KINDS[boxes.kind[i]])
+
+def _found(looked: _Looked, boxes: Boxes, i: int) -> Found:
+    """A candidate as the estimator takes it."""
+    tile = looked.tile
+    left, top, right, bottom = boxes.box[i].tolist()
+    box = (left - tile.col, top - tile.row, right - tile.col, bottom - tile.row)
+    return Found(looked.grey, tile, box, KINDS[boxes.kind[i]])
 
 
 def _best_first(of: Iterable[Scored]) -> tuple[Scored, ...]:
@@ -148,7 +161,7 @@ def _worth_a_look(grid: OccupancyGrid) -> Iterator[GridFrame]:
             yield tile
 
 
-def _batches(of: Iterator[GridFrame]) -> Iterator[list[GridFrame]]:
+def _batches(of: Iterator[Item]) -> Iterator[list[Item]]:
     while batch := list(islice(of, BATCH)):
         yield batch
 

@@ -1,0 +1,216 @@
+"""How good a detector is on a set: the paper's Tables I and II, and what its abstract claims."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import asdict, dataclass
+from typing import Any, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from detect.dataset import Sample, box_of
+from detect.detector import Detector
+from detect.estimator import Found
+from detect.scores import Marked, Scores, best_confidences, score_boxes
+from detect.yolo import KINDS, Boxes, Yolo, overlap, suppress
+from prim.metrics import match_primitives
+from prim.shapes import Kind, Primitive, angle_error
+
+FLOOR = 0.001
+"""Candidates of less are not looked at: as in YOLOv5's own evaluation."""
+
+SUPPRESSION = 0.6
+"""The IoU beyond which the worse of two candidates of a kind goes: as in YOLOv5's own evaluation."""
+
+MOST = 300
+"""No more candidates an image than this: as in YOLOv5's own evaluation."""
+
+BATCH = 8
+
+Result = TypeVar("Result")
+Progress = Callable[[int, int], None]
+
+
+@dataclass(frozen=True)
+class Errors:
+    """A row of Table II: mean absolute errors (rad, m) over ``count`` primitives; angles modulo the symmetry.
+
+    ``size`` is the mean error of the sizes as a share of the true ones; ``median_angle`` the median of the angle's.
+    """
+
+    count: int
+    angle: float | None
+    median_angle: float | None
+    width: float
+    height: float
+    size: float
+    position: float
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """What a detector does on a set: rows for ``all`` and for each kind that occurs.
+
+    ``boxes``: Table I; ``true_boxes``: Table II, parameters read at true boxes; ``detected``: the same for what the
+    whole pipeline finds (kind right, polygons' IoU 0.5); ``found``: of the pipeline, precision, recall and F1 by
+    that rule; ``kind_accuracy``: of true primitives that a detection's box covers (IoU 0.5), the share whose kind is
+    right; times (s) are means of one image, one after the other.
+    """
+
+    images: int
+    boxes: dict[str, Scores]
+    true_boxes: dict[str, Errors]
+    detected: dict[str, Errors]
+    found: tuple[float, float, float]
+    kind_accuracy: float | None
+    yolo_time: float
+    parameters_time: float
+    whole_time: float
+
+    def to_json(self) -> dict[str, Any]:
+        """As it is kept."""
+        return asdict(self)
+
+
+@dataclass(frozen=True)
+class _Pictured:
+    """A sample with its image."""
+
+    sample: Sample
+    image: NDArray[np.uint8]
+
+    @property
+    def true_boxes(self) -> list[Found]:
+        """Its primitives as the estimator takes them."""
+        grey = np.ascontiguousarray(self.image[..., 0])
+        frame = self.sample.frame
+        return [Found(grey, frame, box_of(one, frame), one.kind) for one in self.sample.primitives]
+
+
+def evaluate(detector: Detector, samples: Sequence[Sample], progress: Progress | None = None) -> Evaluation:
+    """Runs a detector over a set's samples."""
+    marked: list[Marked] = []
+    at_truth: list[tuple[Primitive, Primitive]] = []
+    detected: list[tuple[Primitive, Primitive]] = []
+    detections = right = covered = 0
+    times = np.zeros(3)
+    for done, sample in enumerate(samples, start=1):
+        pictured = _Pictured(sample, read_image(sample))
+        times[0] += _timed(lambda one=pictured: detector.yolo(one.image[None], FLOOR))  # type: ignore[misc]
+        marked.append(mark(detector.yolo, [pictured])[0])
+        at_truth += zip(detector.estimator(pictured.true_boxes), sample.primitives, strict=True)
+        times[1] += _timed(lambda one=pictured: detector.estimator(one.true_boxes))  # type: ignore[misc]
+        began = time.perf_counter()
+        found = [
+            one.primitive for one in detector.detect_images([(sample.frame, pictured.image)], sample.frame).found
+        ]
+        times[2] += time.perf_counter() - began
+        detections += len(found)
+        pairs = match_primitives(found, sample.primitives)
+        detected += [(found[pair.detection], sample.primitives[pair.truth]) for pair in pairs if pair.found]
+        kinds = _kinds_on_truth(found, sample)
+        right, covered = right + sum(kinds), covered + len(kinds)
+        if progress:
+            progress(done, len(samples))
+    truths = sum(len(sample.primitives) for sample in samples)
+    mean = times / max(len(samples), 1)
+    return Evaluation(
+        images=len(samples),
+        boxes=score_boxes(marked),
+        true_boxes=_errors(at_truth),
+        detected=_errors(detected),
+        found=_found(len(detected), detections, truths),
+        kind_accuracy=right / covered if covered else None,
+        yolo_time=float(mean[0]),
+        parameters_time=float(mean[1]),
+        whole_time=float(mean[2]),
+    )
+
+
+def choose_thresholds(yolo: Yolo, samples: Sequence[Sample]) -> dict[str, float]:
+    """For each kind the least score that makes its F1 largest on a set's samples."""
+    marked: list[Marked] = []
+    for begin in range(0, len(samples), BATCH):
+        batch = [_Pictured(sample, read_image(sample)) for sample in samples[begin : begin + BATCH]]
+        marked += mark(yolo, batch)
+    return best_confidences(marked)
+
+
+def mark(yolo: Yolo, batch: Sequence[_Pictured]) -> list[Marked]:
+    """Candidates beside true boxes, by the rules of YOLOv5's own evaluation."""
+    images = np.stack([one.image for one in batch])
+    marked = []
+    for one, boxes in zip(batch, yolo(images, FLOOR, every_kind=True), strict=True):
+        true = [box_of(primitive, one.sample.frame) for primitive in one.sample.primitives]
+        kinds = [KINDS.index(primitive.kind) for primitive in one.sample.primitives]
+        marked.append(
+            Marked(thinned(boxes), np.array(true, np.float32).reshape(-1, 4), np.array(kinds, dtype=np.intp))
+        )
+    return marked
+
+
+def thinned(boxes: Boxes) -> Boxes:
+    """The MOST best candidates that no better one of their kind suppresses."""
+    stay = np.flatnonzero(suppress(boxes, SUPPRESSION, per_kind=True) == np.arange(len(boxes)))
+    best = stay[np.argsort(-boxes.score[stay], kind="stable")]
+    return boxes[best[:MOST]]
+
+
+def read_image(sample: Sample) -> NDArray[np.uint8]:
+    """A sample's image (TILE, TILE, 3)."""
+    from PIL import Image
+
+    return np.asarray(Image.open(sample.image))
+
+
+def _timed(call: Callable[[], Result]) -> tuple[Result, float]:
+    """What a call gives, and how long it takes (s)."""
+    began = time.perf_counter()
+    return call(), time.perf_counter() - began
+
+
+def _kinds_on_truth(found: Sequence[Primitive], sample: Sample) -> list[bool]:
+    """For each true primitive that a detection covers: whether the kind of the best such detection is right."""
+    frame = sample.frame
+    boxes = np.array([box_of(one, frame) for one in found], np.float32).reshape(-1, 4)
+    right = []
+    for primitive in sample.primitives:
+        if not len(boxes):
+            break
+        shared = overlap(np.array(box_of(primitive, frame), np.float32), boxes)
+        best = int(shared.argmax())
+        if shared[best] >= 0.5:
+            right.append(found[best].kind is primitive.kind)
+    return right
+
+
+def _found(hits: int, detections: int, truths: int) -> tuple[float, float, float]:
+    """Precision, recall, F1."""
+    return hits / max(detections, 1), hits / max(truths, 1), 2 * hits / max(detections + truths, 1)
+
+
+def _errors(pairs: Sequence[tuple[Primitive, Primitive]]) -> dict[str, Errors]:
+    """Errors of pairs of an estimate and a truth of one kind: for ``all``, and for each kind."""
+    rows = {kind.value: [pair for pair in pairs if pair[1].kind is kind] for kind in Kind}
+    return {name: _mean_errors(own) for name, own in ({"all": list(pairs)} | rows).items() if own}
+
+
+def _mean_errors(pairs: Sequence[tuple[Primitive, Primitive]]) -> Errors:
+    angles = [error for pair in pairs if (error := angle_error(*pair)) is not None]
+    sizes = [(one.width_height, true.width_height) for one, true in pairs]
+    return Errors(
+        count=len(pairs),
+        angle=_mean(angles) if angles else None,
+        median_angle=float(np.median(angles)) if angles else None,
+        width=_mean(abs(one[0] - true[0]) for one, true in sizes),
+        height=_mean(abs(one[1] - true[1]) for one, true in sizes),
+        size=_mean(abs(one[k] - true[k]) / true[k] for one, true in sizes for k in (0, 1)),
+        position=_mean(math.hypot(one.x - true.x, one.y - true.y) for one, true in pairs),
+    )
+
+
+def _mean(values: Iterable[float]) -> float:
+    return float(np.mean(list(values)))
