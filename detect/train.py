@@ -289,12 +289,14 @@ def _trainer() -> type:
     """Ultralytics' trainer, with images and filters laid out channels last: convolutions on a CPU are faster so."""
     from ultralytics.models.yolo.detect import DetectionTrainer
 
+    threads = int(os.environ.get("OMP_NUM_THREADS", len(os.sched_getaffinity(0))))
+
     class ChannelsLast(DetectionTrainer):
         def get_model(self, *args: Any, **options: Any) -> Any:
             return super().get_model(*args, **options).to(memory_format=torch.channels_last)
 
         def preprocess_batch(self, batch: Any) -> Any:
-            torch.set_num_threads(len(os.sched_getaffinity(0)))  # ultralytics leaves one core idle
+            torch.set_num_threads(threads)  # ultralytics leaves one core idle
             batch = super().preprocess_batch(batch)
             batch["img"] = batch["img"].contiguous(memory_format=torch.channels_last)
             return batch
