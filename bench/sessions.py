@@ -10,6 +10,7 @@ from mapping.grid import GridFrame
 from mapping.truth import TruthMap
 from prim.frames import Pose2D, Scan
 from prim.log import LogReader
+from prim.shapes import Primitive
 from recorder.session import SessionOptions, record
 from replay.localize import Localizer
 from replay.pipeline import WORLD_MARGIN
@@ -19,11 +20,12 @@ from replay.truth import Truth
 
 @dataclass(frozen=True)
 class Session:
-    """Scans with the poses of their laser, the frame of their map and, for recorded ones, the true cells."""
+    """Scans with the poses of their laser, the frame of their map; for recorded ones, true cells and primitives."""
 
     scans: list[tuple[Scan, Pose2D]]
     frame: GridFrame
     truth: TruthMap | None
+    primitives: tuple[Primitive, ...] = ()
 
 
 def recorded(options: SessionOptions, resolution: float = 0.01) -> Session:
@@ -41,7 +43,7 @@ def recorded(options: SessionOptions, resolution: float = 0.01) -> Session:
     cells = TruthMap(frame)
     for scan, pose in scans:
         cells.update(scan, pose, truth.at(scan.stamp))
-    return Session(scans, frame, cells)
+    return Session(scans, frame, cells, truth.world.primitives)
 
 
 def posed_scans(log: LogReader, source: str = "auto") -> list[tuple[Scan, Pose2D]]:

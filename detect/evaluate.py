@@ -6,6 +6,7 @@ import math
 import time
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import asdict, dataclass
+from functools import partial
 from typing import Any, TypeVar
 
 import numpy as np
@@ -99,15 +100,14 @@ def evaluate(detector: Detector, samples: Sequence[Sample], progress: Progress |
     times = np.zeros(3)
     for done, sample in enumerate(samples, start=1):
         pictured = _Pictured(sample, read_image(sample))
-        times[0] += _timed(lambda one=pictured: detector.yolo(one.image[None], FLOOR))  # type: ignore[misc]
-        marked.append(mark(detector.yolo, [pictured])[0])
-        at_truth += zip(detector.estimator(pictured.true_boxes), sample.primitives, strict=True)
-        times[1] += _timed(lambda one=pictured: detector.estimator(one.true_boxes))  # type: ignore[misc]
-        began = time.perf_counter()
-        found = [
-            one.primitive for one in detector.detect_images([(sample.frame, pictured.image)], sample.frame).found
-        ]
-        times[2] += time.perf_counter() - began
+        _, yolo_time = _timed(partial(detector.yolo, pictured.image[None], FLOOR))
+        read, parameters_time = _timed(partial(detector.estimator, pictured.true_boxes))
+        tile = [(sample.frame, pictured.image)]
+        whole, whole_time = _timed(partial(detector.detect_images, tile, sample.frame))
+        times += yolo_time, parameters_time, whole_time
+        marked += mark(detector.yolo, [pictured])
+        at_truth += zip(read, sample.primitives, strict=True)
+        found = [one.primitive for one in whole.found]
         detections += len(found)
         pairs = match_primitives(found, sample.primitives)
         detected += [(found[pair.detection], sample.primitives[pair.truth]) for pair in pairs if pair.found]
