@@ -1,0 +1,94 @@
+"""The whole pipeline at the paper's four noise levels (its Fig. 5): python -m docs.pipeline SUITE docs/pipeline.png.
+
+SUITE is the folder of ``prim-eval --suite paper``. Rows are mappers, columns noise levels as the paper's maps suggest
+(n = 0 with the networks that were trained without noise, the others with those that were trained at 0.05); the same
+world and poses everywhere. Found primitives in colour with kind and score, true ones in grey.
+"""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+import numpy as np
+from PIL import Image, ImageDraw
+
+from bench.maps import session_of
+from detect.detector import Detection, Detector
+from mapping.grid import OccupancyGrid
+from mapping.mapper import make_mapper
+from prim.shapes import Kind, Primitive
+
+NOISE = {0.0: "n = 0", 0.05: "n = 0.05", 0.075: "n = 0.075", 0.1: "n = 0.1"}
+MAPPERS = ("det", "prob", "forward")
+SCALE, GAP, LABEL = 2, 8, 20
+COLOURS = {
+    Kind.SQUARE: (0, 114, 178),
+    Kind.RECTANGLE: (213, 94, 0),
+    Kind.CIRCLE: (0, 158, 115),
+    Kind.TRIANGLE: (204, 121, 167),
+    Kind.ELLIPSE: (230, 159, 0),
+}
+TRUTH = (140, 140, 140)
+SEED = 40_002
+
+
+def networks(suite: Path, mapper: str, noise_std: float) -> Detector:
+    """The networks that a noise level is looked at with; prob has none that were trained without noise."""
+    trained = 0 if noise_std == 0 and mapper != "prob" else 50
+    return Detector.load(suite / "networks" / f"{mapper}-{trained}", mapper)
+
+
+def draw(grid: OccupancyGrid, found: tuple[Detection, ...], truth: tuple[Primitive, ...]) -> Image.Image:
+    """One map with what was found in it and what is there, the largest y at the top."""
+    grey = np.flipud(np.rint(255 * (1 - grid.probability)).astype(np.uint8))
+    picture = Image.fromarray(np.repeat(np.repeat(grey, SCALE, 0), SCALE, 1)).convert("RGB")
+    pen = ImageDraw.Draw(picture)
+
+    def corners(primitive: Primitive) -> list[tuple[float, float]]:
+        cells = primitive.outline() / grid.frame.resolution - (grid.frame.col, grid.frame.row)
+        return [(SCALE * x, SCALE * (grid.frame.rows - y)) for x, y in cells.tolist()]
+
+    for primitive in truth:
+        ring = corners(primitive)
+        for a, b in zip(ring, [*ring[1:], ring[0]], strict=True):
+            pen.line((a, b), fill=TRUTH, width=1)
+    for one in found:
+        ring, colour = corners(one.primitive), COLOURS[one.primitive.kind]
+        pen.line([*ring, ring[0]], fill=colour, width=2)
+        x, y = min(x for x, _ in ring), min(y for _, y in ring)
+        pen.text((x, y - 12), f"{one.primitive.kind} {one.score:.2f}", fill=colour)
+    return picture
+
+
+def pictures(suite: Path) -> Image.Image:
+    """All mappers and noise levels side by side."""
+    rows = []
+    for mapper in MAPPERS:
+        row = []
+        for noise_std in NOISE:
+            session = session_of(SEED, noise_std)
+            made = make_mapper(mapper, 0.01, session.frame.bounds)
+            for scan, pose in session.scans:
+                made.update(scan, pose)
+            grid = made.finish()
+            found = networks(suite, mapper, noise_std).detect(grid).found
+            row.append(draw(grid, found, session.primitives))
+        rows.append(row)
+    width, height = rows[0][0].size
+    sheet = Image.new("RGB", (len(NOISE) * (width + GAP) + GAP, len(rows) * (height + LABEL + GAP) + GAP), "white")
+    pen = ImageDraw.Draw(sheet)
+    for i, (mapper, row) in enumerate(zip(MAPPERS, rows, strict=True)):
+        for j, (name, picture) in enumerate(zip(NOISE.values(), row, strict=True)):
+            x, y = GAP + j * (width + GAP), GAP + i * (height + LABEL + GAP)
+            pen.text((x, y + 4), f"{mapper}, {name}", fill="black")
+            sheet.paste(picture, (x, y + LABEL))
+    return sheet
+
+
+if __name__ == "__main__":
+    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser.add_argument("suite", type=Path)
+    parser.add_argument("picture", type=Path)
+    options = parser.parse_args()
+    pictures(options.suite).save(options.picture, optimize=True)
