@@ -102,6 +102,14 @@ def replay(
     map_every: Annotated[
         int | None, typer.Option(metavar="N", help="Show the map every N scans. [default: about 50 times]")
     ] = None,
+    no_detect: Annotated[bool, typer.Option("--no-detect", help="Look for no primitives.")] = False,
+    detect_every: Annotated[
+        int | None, typer.Option(metavar="N", help="Look for primitives every N scans as well as at the end.")
+    ] = None,
+    weights: Annotated[
+        Path | None,
+        typer.Option(metavar="W.onnx", help="The detector's YOLO, or its folder. [default: what comes with prim]"),
+    ] = None,
     save: Annotated[Path | None, typer.Option(metavar="OUT.rrd", help="Save the rerun recording here.")] = None,
     spawn: Annotated[bool, typer.Option("--spawn", help="Open a rerun viewer and show the replay.")] = False,
     connect: Annotated[
@@ -118,7 +126,9 @@ def replay(
     ] = None,
     recover: Annotated[bool, typer.Option("--recover", help="Read what is left of a damaged log.")] = False,
     quiet: Annotated[bool, typer.Option("--quiet", help="Print errors only.")] = False,
-    verbose: Annotated[bool, typer.Option("--verbose", help="Say where the time goes.")] = False,
+    verbose: Annotated[
+        bool, typer.Option("--verbose", help="Say where the time goes, and what was not taken for a primitive.")
+    ] = False,
     debug: Annotated[bool, typer.Option("--debug", help="Show tracebacks.")] = False,
     version: Annotated[
         bool, typer.Option("--version", callback=_show_version, is_eager=True, help="Print the version.")
@@ -155,6 +165,9 @@ def replay(
         selection=Selection(start, end, duration, n_scans, stride),
         rate=rate,
         map_every=map_every,
+        detect=not no_detect,
+        detect_every=detect_every,
+        weights=weights,
         recover=recover,
     )
     codes = []
@@ -254,6 +267,10 @@ def _print_result(result: ReplayResult, outputs: Outputs, verbose: bool) -> None
 
     for note in result.notes:
         typer.echo(f"note: {note}", err=True)
+    if verbose and result.sighting is not None:
+        for one in result.sighting.detections.rejected:
+            what = f"{one.kind} at ({one.x:.2f}, {one.y:.2f}) m, score {one.score:.2f}"
+            typer.echo(f"rejected: {what}: {one.reason}", err=True)
     rows = Table(show_header=False, box=None, pad_edge=False)
     for name, value in table(result):
         rows.add_row(Text(name), Text(value))

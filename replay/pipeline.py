@@ -23,6 +23,7 @@ from prim.metrics import MapScores, pose_rmse
 from prim.shapes import angle_difference
 from prim.world import Bounds, World
 from replay.localize import STILL, LaserPoses, Localizer
+from replay.lookout import Lookout, Sighting, shipped_weights
 from replay.scans import ScanLog, Selection, counted, turned_over
 from replay.show import NullViewer, Scene, Viewer
 from replay.truth import Truth
@@ -64,6 +65,9 @@ class ReplayOptions:
     selection: Selection = field(default_factory=Selection)
     rate: float | None = None
     map_every: int | None = None
+    detect: bool = True
+    detect_every: int | None = None
+    weights: Path | None = None
     recover: bool = False
 
     def __post_init__(self) -> None:
@@ -78,6 +82,10 @@ class ReplayOptions:
             raise UsageError(f"--max-range is {self.max_range:g}: it must be above 0")
         if self.map_every is not None and self.map_every < 1:
             raise UsageError(f"--map-every is {self.map_every}: it must be at least 1")
+        if self.detect_every is not None and self.detect_every < 1:
+            raise UsageError(f"--detect-every is {self.detect_every}: it must be at least 1")
+        if not self.detect and (self.detect_every or self.weights):
+            raise UsageError("--no-detect excludes --detect-every and --weights")
         if self.standing_still and (self.pose != "auto" or self.odom_topic):
             raise UsageError("--standing-still excludes --pose and --odom-topic")
         if self.odom_topic and self.pose not in ("auto", "odom"):
@@ -106,6 +114,7 @@ class ReplayResult:
     grid: OccupancyGrid
     noise_std: float | None
     scores: MapScores | None
+    sighting: Sighting | None
     seconds: dict[str, float]
 
 
@@ -178,6 +187,7 @@ class Pipeline:
             with self._clock.stage("localize"):
                 poses, true_poses = self._localize(log, scans)
             frame = self._frame(scans, poses, truth)
+            lookout = self._lookout(frame, truth)
             mapper = self._mapper(scans, poses, frame)
             judge = Judge(frame, truth, poses, true_poses)
             scene = Scene(
@@ -187,17 +197,25 @@ class Pipeline:
                 judge.scores_maps,
                 judge.compares_poses,
                 has_evidence=self.options.mapper == "forward",
+                has_detections=lookout is not None,
+                has_errors=lookout is not None and truth is not None,
             )
             self._begin(log, scans, poses, scene)
-            used = self._map_scans(scans, poses, mapper, judge, truth, self._map_every(len(scans), frame))
+            used = self._map_scans(scans, poses, mapper, judge, truth, lookout, self._map_every(len(scans), frame))
             with self._clock.stage("map"):
                 grid = mapper.finish()
             scores = judge.score(grid)
+            last = len(scans) - 1
+            stamp = int(scans.stamps[last])
+            sighting = None
+            if lookout is not None:
+                with self._clock.stage("detect"):
+                    sighting = lookout.look_at_last(grid, stamp)
             self._note_what_was_used(scans, poses, used, grid)
-            result = self._result(log, scans, poses, used, grid, mapper.noise_std, scores, judge)
+            result = self._result(log, scans, poses, used, grid, mapper.noise_std, scores, sighting, judge)
             with self._clock.stage("viewer"):
-                last = len(scans) - 1
-                stamp = int(scans.stamps[last])
+                if sighting is not None:
+                    self.viewer.show_sighting(last, stamp, sighting)
                 for note in result.notes:
                     self.viewer.event(last, stamp, note, warning=True)
                 self.viewer.show_map(last, stamp, grid, scores)
@@ -269,6 +287,24 @@ class Pipeline:
                 )
         return make_mapper(options.mapper, options.resolution, frame.bounds, options.sensor_model, noise_std)
 
+    def _lookout(self, frame: GridFrame, truth: Truth | None) -> Lookout | None:
+        """What looks for primitives; None where nothing shall, or no weights are for this mapper."""
+        options = self.options
+        weights = options.weights or shipped_weights(options.mapper)
+        if not options.detect or weights is None:
+            if options.detect_every:
+                raise UsageError(f"--detect-every: no weights come with prim for {options.mapper}: give --weights")
+            return None
+        from detect.detector import Detector  # when it is needed: a replay without detection starts faster
+
+        with self._clock.stage("detect"):
+            detector = Detector.load(weights, options.mapper)
+        cell = detector.card.resolution
+        own = None
+        if not np.isclose(options.resolution, cell, rtol=1e-6):
+            own = make_mapper(options.mapper, cell, frame.bounds, "eq4", options.noise_std)
+        return Lookout(detector, own, truth)
+
     def _posed(self, scans: ScanLog, poses: LaserPoses) -> Iterator[tuple[int, Scan, Pose2D]]:
         """The scans that have a pose: position, scan as seen from above, pose of the laser."""
         source = iter(scans)
@@ -325,13 +361,15 @@ class Pipeline:
         mapper: Mapper,
         judge: Judge,
         truth: Truth | None,
+        lookout: Lookout | None,
         map_every: int | None,
     ) -> Used:
         """Maps, scores and shows scan by scan; returns what was used."""
         used = Used()
         shown: World | None = None
         pace = Pace(self.options.rate)
-        add = mapper.update if map_every else mapper.keep
+        every = self.options.detect_every if lookout else None
+        add = mapper.update if map_every or every else mapper.keep
         for position, scan, pose in self._posed(scans, poses):
             stamp = int(scans.stamps[position])
             pace.wait(stamp)
@@ -341,6 +379,8 @@ class Pipeline:
             seconds = time.perf_counter() - start
             judge.update(position, scan, stamp)
             used.count(scan)
+            if lookout is not None:
+                self._look(lookout, mapper, position, stamp, scan, pose)
             with self._clock.stage("viewer"):
                 if truth is not None and truth.at(stamp) is not shown:
                     shown = truth.at(stamp)
@@ -358,6 +398,17 @@ class Pipeline:
             self._progress(position + 1, len(scans))
         return used
 
+    def _look(self, lookout: Lookout, mapper: Mapper, position: int, stamp: int, scan: Scan, pose: Pose2D) -> None:
+        """Shows the detector a scan and, where it is time, lets it look."""
+        every = self.options.detect_every
+        with self._clock.stage("detect"):
+            (lookout.update if every else lookout.keep)(scan, pose)
+            if not every or (position + 1) % every:
+                return
+            sighting = lookout.look(mapper, stamp)
+        with self._clock.stage("viewer"):
+            self.viewer.show_sighting(position, stamp, sighting)
+
     def _result(
         self,
         log: LogReader,
@@ -367,6 +418,7 @@ class Pipeline:
         grid: OccupancyGrid,
         noise_std: float | None,
         scores: MapScores | None,
+        sighting: Sighting | None,
         judge: Judge,
     ) -> ReplayResult:
         return ReplayResult(
@@ -385,6 +437,7 @@ class Pipeline:
             grid=grid,
             noise_std=noise_std,
             scores=scores,
+            sighting=sighting,
             seconds=self._clock.seconds | {"total": self._clock.total()},
         )
 

@@ -14,7 +14,11 @@ import numpy as np
 
 from mapping.grid import OccupancyGrid
 from prim.errors import OutputError
+from prim.metrics import DetectionErrors
+from prim.shapes import Kind
+from replay.lookout import Sighting
 from replay.pipeline import ReplayResult
+from replay.scans import counted
 
 SCHEMA = "prim-replay/1"
 
@@ -51,13 +55,53 @@ def report(result: ReplayResult) -> dict[str, Any]:
             "evidence": _evidence(result.grid),
             "scores": result.scores.to_json() if result.scores else None,
         },
-        "primitives": [],
-        "errors": None,
+        "primitives": _primitives(result.sighting),
+        "errors": _errors(result.sighting),
         "timing": {f"{name}_s": value for name, value in seconds.items()}
         | {
             "rays_per_s": result.rays / seconds["map"] if seconds["map"] else None,
             "x_realtime": result.duration / seconds["total"] if seconds["total"] else None,
         },
+    }
+
+
+def _primitives(sighting: Sighting | None) -> list[dict[str, Any]]:
+    """What was found, best first."""
+    found = () if sighting is None else sighting.detections.found
+    return [
+        {"id": number} | one.primitive.to_json() | {"score": one.score, "stage": "detected", "std": None}
+        for number, one in enumerate(found, start=1)
+    ]
+
+
+def _errors(sighting: Sighting | None) -> dict[str, Any] | None:
+    """How what was found compares with the truth; lengths in metres, angles in radians."""
+    if sighting is None or sighting.errors is None:
+        return None
+    errors, found = sighting.errors, sighting.detections.found
+    return {
+        "precision": errors.precision,
+        "recall": errors.recall,
+        "f1": errors.f1,
+        "position_m": errors.position,
+        "angle_rad": errors.angle,
+        "width_m": errors.width,
+        "height_m": errors.height,
+        "iou": errors.iou,
+        "pairs": [
+            {
+                "id": pair.detection + 1,
+                "truth": pair.truth,
+                "kind": str(found[pair.detection].primitive.kind),
+                "truth_kind": str(sighting.truth[pair.truth].kind),
+                "position_m": pair.position,
+                "angle_rad": pair.angle,
+                "width_m": pair.width,
+                "height_m": pair.height,
+                "iou": pair.iou,
+            }
+            for pair in errors.pairs
+        ],
     }
 
 
@@ -145,9 +189,30 @@ def table(result: ReplayResult) -> list[tuple[str, str]]:
             ("free", f"{_percent(scores.free_accuracy)} right"),
             ("AUC", "-" if scores.auc is None else f"{scores.auc:.4f}"),
         ]  # fmt: skip
+    if result.sighting is not None:
+        rows.append(("primitives", _counted(result.sighting)))
+        if result.sighting.errors is not None:
+            rows += _quality(result.sighting.errors)
     rate = result.rays / seconds["map"] / 1e6 if seconds["map"] else 0.0
     rows.append(("time", f"{seconds['total']:.2f} s, mapping {seconds['map']:.3f} s ({rate:.2f} M rays/s)"))
     return rows
+
+
+def _counted(sighting: Sighting) -> str:
+    """How many of each kind were found."""
+    kinds = [one.primitive.kind for one in sighting.detections.found]
+    each = [counted(kinds.count(kind), kind) for kind in Kind if kind in kinds]
+    return ", ".join(each) or "none found"
+
+
+def _quality(errors: DetectionErrors) -> Iterator[tuple[str, str]]:
+    """How much was found of what is there, and how far off it is on average."""
+    found = f"precision {errors.precision:.1%}, recall {errors.recall:.1%}, F1 {errors.f1:.1%}"
+    yield "detection", f"{found} (kind, IoU 0.5)"
+    if errors.position is not None and errors.width is not None and errors.height is not None:
+        size = 500 * (errors.width + errors.height)
+        turn = "" if errors.angle is None else f", angle {np.degrees(errors.angle):.1f} deg"
+        yield "errors", f"position {1000 * errors.position:.1f} mm, size {size:.1f} mm{turn} (means)"
 
 
 def _noise(std: float, given: bool, resolution: float) -> str:

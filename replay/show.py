@@ -13,6 +13,7 @@ from prim.metrics import MapScores
 from prim.world import Bounds, World
 
 if TYPE_CHECKING:
+    from replay.lookout import Sighting
     from replay.pipeline import ReplayResult
 
 
@@ -46,7 +47,8 @@ class Scene:
     """What is known before the first scan.
 
     The log's name, the mapper, the map's bounds (m), whether the map and the poses are held against the truth, and
-    whether the mapper says how much evidence each cell has.
+    whether the mapper says how much evidence each cell has; whether primitives are looked for, and held against the
+    truth.
     """
 
     log: str
@@ -55,6 +57,8 @@ class Scene:
     has_scores: bool
     has_pose_errors: bool
     has_evidence: bool = False
+    has_detections: bool = False
+    has_errors: bool = False
 
 
 class Viewer(Protocol):
@@ -79,6 +83,9 @@ class Viewer(Protocol):
 
     def show_pose_error(self, position: int, stamp: int, metres: float, radians: float) -> None:
         """How far the pose in use is from the true one."""
+
+    def show_sighting(self, position: int, stamp: int, sighting: Sighting) -> None:
+        """The primitives found in the map so far."""
 
     def event(self, position: int, stamp: int, text: str, warning: bool = False) -> None:
         """A line for the log of events."""
@@ -108,6 +115,9 @@ class NullViewer:
         """Nothing."""
 
     def show_pose_error(self, position: int, stamp: int, metres: float, radians: float) -> None:
+        """Nothing."""
+
+    def show_sighting(self, position: int, stamp: int, sighting: Sighting) -> None:
         """Nothing."""
 
     def event(self, position: int, stamp: int, text: str, warning: bool = False) -> None:

@@ -9,7 +9,7 @@ import time
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 from urllib.parse import quote, urlsplit
 
 import numpy as np
@@ -20,12 +20,17 @@ from numpy.typing import NDArray
 from mapping.grid import OccupancyGrid
 from prim.errors import OutputError, PrimError, UsageError
 from prim.frames import Pose2D, Scan
-from prim.metrics import MapScores
+from prim.metrics import DetectionErrors, MapScores
 from prim.raycast import FloatArray
+from prim.shapes import Kind
 from prim.world import World
+from replay.lookout import Sighting
 from replay.pipeline import ReplayResult
 from replay.report import table
 from replay.show import Scene, ViewerOptions
+
+if TYPE_CHECKING:
+    from detect.detector import Detection
 
 APPLICATION = "prim"
 STAMP, SCAN = "stamp", "scan"
@@ -36,7 +41,7 @@ BATCH_SECONDS = 0.1
 """Scans are sent in batches, no larger and no older than this; a batch costs little more than one scan."""
 
 TRAIL_POINTS = 2000
-TRAIL_LIFT, SCAN_LIFT, TRUTH_LIFT = 0.0004, 0.0008, 0.0012
+TRAIL_LIFT, SCAN_LIFT, TRUTH_LIFT, FOUND_LIFT = 0.0004, 0.0008, 0.0012, 0.0016
 """Heights above the map, as shares of its size: enough to keep what is drawn on it from flickering."""
 
 GRPC_PORT, WEB_PORT = 9876, 9090
@@ -66,6 +71,31 @@ SCORES = {
     "auc": ("AUC", (204, 121, 167)),
 }
 """The map's scores over time: name and colour of each line."""
+
+KIND_COLORS: dict[Kind, Color] = {
+    Kind.SQUARE: (0, 114, 178),
+    Kind.RECTANGLE: (213, 94, 0),
+    Kind.CIRCLE: (0, 158, 115),
+    Kind.TRIANGLE: (204, 60, 150),
+    Kind.ELLIPSE: (200, 130, 0),
+}
+
+SHARES = {
+    "f1": ("F1", (255, 255, 255)),
+    "precision": ("precision", (86, 180, 233)),
+    "recall": ("recall", (230, 159, 0)),
+    "iou": ("mean IoU", (0, 158, 115)),
+}
+"""How much of what is there was found, over time."""
+
+LENGTHS = {
+    "position": ("position, mm", (86, 180, 233)),
+    "width": ("width, mm", (230, 159, 0)),
+    "height": ("height, mm", (0, 158, 115)),
+}
+"""Mean errors of what was found, over time; the angle's has a plot of its own scale."""
+
+CROPS_IN_A_ROW = 6
 
 
 class RerunViewer:
@@ -105,6 +135,10 @@ class RerunViewer:
         self._name_series("scores", SCORES.values())
         self._name_series("pose_error/position", [("position, mm", (86, 180, 233))])
         self._name_series("pose_error/heading", [("heading, degrees", (230, 159, 0))])
+        if scene.has_errors:
+            self._name_series("errors/found", SHARES.values())
+            self._name_series("errors/lengths", LENGTHS.values())
+            self._name_series("errors/angle", [("angle, degrees", (204, 121, 167))])
         self._name_series("timing", [("mapping, ms a scan", (86, 180, 233))])
 
     def show_truth(self, position: int, stamp: int, world: World) -> None:
@@ -144,6 +178,32 @@ class RerunViewer:
         if scores is not None:
             values = [value if (value := getattr(scores, name)) is not None else math.nan for name in SCORES]
             self._recording.log("scores", rr.Scalars(values))
+
+    def show_sighting(self, position: int, stamp: int, sighting: Sighting) -> None:
+        """The primitives found in the map so far: outlines, table, crops, errors."""
+        self._send_batch()
+        self._at(position, stamp)
+        found = sighting.detections.found
+        self._recording.log("map/detections", self._outlines(found))
+        self._recording.log("detections", rr.TextDocument(_detections_table(found), media_type="text/markdown"))
+        self._recording.log("crops", rr.Image(_crops(found)))
+        errors = sighting.errors
+        if errors is not None:
+            self._recording.log("errors/found", rr.Scalars(_values(errors, SHARES, 1.0)))
+            self._recording.log("errors/lengths", rr.Scalars(_values(errors, LENGTHS, 1000.0)))
+            angle = math.nan if errors.angle is None else math.degrees(errors.angle)
+            self._recording.log("errors/angle", rr.Scalars([angle]))
+
+    def _outlines(self, found: Sequence[Detection]) -> Any:
+        """Found primitives as labelled outlines in their kind's colour."""
+        rings = [np.vstack((ring := one.primitive.outline(64), ring[:1])) for one in found]
+        return rr.LineStrips3D(
+            [self._lifted(ring, FOUND_LIFT) for ring in rings],
+            labels=[f"{number}: {one.primitive.kind} {one.score:.2f}" for number, one in enumerate(found, start=1)],
+            colors=[KIND_COLORS[one.primitive.kind] for one in found],
+            radii=rr.Radius.ui_points(2.0),
+            show_labels=True,
+        )
 
     def show_pose_error(self, position: int, stamp: int, metres: float, radians: float) -> None:
         """How far the pose in use is from the true one."""
@@ -294,7 +354,16 @@ def _blueprint(scene: Scene) -> rrb.Blueprint:
     left: Any = from_above("map", f"Map ({scene.mapper}), from above")
     if scene.has_evidence:
         left = rrb.Tabs(left, from_above("evidence", "Evidence: rays per cell"), active_tab=0)
-    right: list[Any] = [rrb.TextDocumentView(origin="summary", name="Result")]
+    result: Any = rrb.TextDocumentView(origin="summary", name="Result")
+    if scene.has_detections:
+        table = rrb.TextDocumentView(origin="detections", name="Detections")
+        crops = rrb.Spatial2DView(origin="crops", name="Crops, as the networks see them")
+        result = rrb.Tabs(result, table, crops, active_tab=0)
+    right: list[Any] = [result]
+    if scene.has_errors:
+        found = _series("errors/found", "Primitives found", axis_y=rrb.ScalarAxis(range=(0.0, 1.02), zoom_lock=True))
+        lengths, angle = _series("errors/lengths", "Errors: lengths"), _series("errors/angle", "Errors: angle")
+        right.append(rrb.Tabs(found, lengths, angle, active_tab=0))
     if scene.has_scores:
         unit = rrb.ScalarAxis(range=(0.0, 1.02), zoom_lock=True)
         right.append(_series("scores", "Map accuracy", axis_y=unit))
@@ -313,6 +382,37 @@ def _blueprint(scene: Scene) -> rrb.Blueprint:
 def _series(origin: str, name: str, **properties: Any) -> rrb.TimeSeriesView:
     legend = rrb.PlotLegend(rrb.Corner2D.RightBottom)
     return rrb.TimeSeriesView(origin=origin, name=name, plot_legend=legend, **properties)
+
+
+def _values(errors: DetectionErrors, series: Iterable[str], unit: float) -> list[float]:
+    """Some of the errors, in a plot's units; what there is not leaves a gap."""
+    return [math.nan if (value := getattr(errors, name)) is None else unit * value for name in series]
+
+
+def _detections_table(found: Sequence[Detection]) -> str:
+    """Found primitives as a Markdown table: lengths in millimetres, angles in degrees."""
+    lines = ["| | kind | score | x, mm | y, mm | angle | size, mm |", "|---|---|---:|---:|---:|---:|---|"]
+    for number, one in enumerate(found, start=1):
+        primitive = one.primitive
+        angle = "" if primitive.theta is None else f"{math.degrees(primitive.theta):.1f}°"
+        size = ", ".join(f"{name} {1000 * value:.0f}" for name, value in primitive.sizes.items())
+        place = f"{1000 * primitive.x:.0f} | {1000 * primitive.y:.0f}"
+        lines.append(
+            f"| {number} | {primitive.kind} | {one.score:.2f} | {place} | {angle} | {size.replace('_', ' ')} |"
+        )
+    return "\n".join(lines) + "\n"
+
+
+def _crops(found: Sequence[Detection]) -> NDArray[np.uint8]:
+    """The crops as the networks see them, in rows, black where occupied; the largest y at the top."""
+    side = max((len(one.crop) for one in found), default=1)
+    rows = max(1, -(-len(found) // CROPS_IN_A_ROW))
+    sheet = np.full((rows * (side + 2), CROPS_IN_A_ROW * (side + 2)), 215, np.uint8)
+    for k, one in enumerate(found):
+        row, col = k // CROPS_IN_A_ROW * (side + 2), k % CROPS_IN_A_ROW * (side + 2)
+        height, width = one.crop.shape
+        sheet[row : row + height, col : col + width] = 255 - np.flipud(one.crop)
+    return sheet
 
 
 def _grid_map(grid: OccupancyGrid) -> rr.GridMap:

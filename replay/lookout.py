@@ -1,0 +1,72 @@
+"""Primitives in a replay: which map the detector looks at, what it finds, and how right that is."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from mapping.grid import OccupancyGrid
+from mapping.mapper import Mapper
+from prim.frames import Pose2D, Scan
+from prim.metrics import DetectionErrors, detection_errors
+from prim.shapes import Primitive
+from replay.truth import Truth
+
+if TYPE_CHECKING:
+    from detect.detector import Detections, Detector
+
+SHIPPED = Path(__file__).parents[1] / "detect" / "shipped"
+"""The weights that come with prim: a folder for each mapper."""
+
+
+@dataclass(frozen=True)
+class Sighting:
+    """What was found in a map; where there is a truth, the true primitives and how it compares with them."""
+
+    detections: Detections
+    truth: tuple[Primitive, ...] = ()
+    errors: DetectionErrors | None = None
+
+
+class Lookout:
+    """Looks for primitives with a detector: in the replay's map, or in one of its own where cells differ.
+
+    ``own`` is a mapper with cells of the size that the detector reads; None where the replay's own map has them.
+    """
+
+    def __init__(self, detector: Detector, own: Mapper | None, truth: Truth | None) -> None:
+        self._detector = detector
+        self._own = own
+        self._truth = truth
+
+    def keep(self, scan: Scan, pose: Pose2D) -> None:
+        """Adds a scan to the detector's own map, for a look at the end."""
+        if self._own is not None:
+            self._own.keep(scan, pose)
+
+    def update(self, scan: Scan, pose: Pose2D) -> None:
+        """Adds a scan to the detector's own map, for looks on the way."""
+        if self._own is not None:
+            self._own.update(scan, pose)
+
+    def look(self, mapper: Mapper, stamp: int) -> Sighting:
+        """What is in the map so far."""
+        return self._sighting((self._own or mapper).grid(), stamp)
+
+    def look_at_last(self, grid: OccupancyGrid, stamp: int) -> Sighting:
+        """What is in the finished map."""
+        return self._sighting(grid if self._own is None else self._own.finish(), stamp)
+
+    def _sighting(self, grid: OccupancyGrid, stamp: int) -> Sighting:
+        detections = self._detector.detect(grid)
+        if self._truth is None:
+            return Sighting(detections)
+        true = tuple(self._truth.at(stamp).primitives)
+        return Sighting(detections, true, detection_errors([one.primitive for one in detections.found], true))
+
+
+def shipped_weights(mapper: str) -> Path | None:
+    """The weights for a mapper's maps that come with prim; None where none do."""
+    folder = SHIPPED / mapper
+    return folder if folder.is_dir() else None

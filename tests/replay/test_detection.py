@@ -1,0 +1,134 @@
+"""Primitives in a replay: the report, the recording, the detector's own map; with a detector that knows the truth."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from detect.detector import Detection, Detections, Detector, Rejection
+from detect.weights import Card
+from mapping.grid import OccupancyGrid
+from mapping.mapper import MAPPERS
+from prim import console
+from prim.errors import UsageError
+from prim.shapes import Kind
+from recorder.session import Session
+from replay import cli
+from replay.pipeline import Pipeline, ReplayOptions, ReplayResult
+from replay.report import report
+from replay.show import ViewerOptions
+from replay.viewer import RerunViewer
+from tests.replay.test_viewer import rows_of, timed, value
+
+
+class Knowing:
+    """A detector that finds what is there, 10 mm to the right, and rejects one candidate; ``seen`` are its maps."""
+
+    card = Card("yolo", "any")
+
+    def __init__(self, session: Session) -> None:
+        self.session = session
+        self.seen: list[OccupancyGrid] = []
+
+    def detect(self, grid: OccupancyGrid) -> Detections:
+        self.seen.append(grid)
+        crop = np.full((72, 72), 7, np.uint8)
+        moved = [replace(one, x=one.x + 0.01) for one in self.session.world.primitives]
+        rejection = Rejection(Kind.CIRCLE, 0.1, 0.5, 0.25, "score 0.10 is below 0.30, the least for a circle")
+        return Detections(tuple(Detection(one, 0.9, crop) for one in moved), (rejection,))
+
+
+@pytest.fixture
+def knowing(noisy_session: Session, monkeypatch: pytest.MonkeyPatch) -> Knowing:
+    made = Knowing(noisy_session)
+    monkeypatch.setattr(Detector, "load", lambda path, mapper=None, threads=None: made)
+    return made
+
+
+def replayed(session: Session, viewer: RerunViewer | None = None, **options: object) -> ReplayResult:
+    chosen = ReplayOptions(weights=Path("w"), **options)  # type: ignore[arg-type]
+    return Pipeline(session.path, chosen, viewer).run()
+
+
+@pytest.mark.parametrize("mapper", MAPPERS)
+def test_the_report_lists_what_was_found(noisy_session: Session, knowing: Knowing, mapper: str) -> None:
+    told = report(replayed(noisy_session, mapper=mapper))
+    assert json.loads(json.dumps(told)) == told
+    truth = noisy_session.world.primitives
+    assert [one["id"] for one in told["primitives"]] == list(range(1, len(truth) + 1))
+    for one, true in zip(told["primitives"], truth, strict=True):
+        assert (one["kind"], one["stage"], one["score"], one["std"]) == (true.kind, "detected", 0.9, None)
+        assert one["x"] == pytest.approx(true.x + 0.01) and one["size"] == true.sizes
+    errors = told["errors"]
+    assert [errors[name] for name in ("position_m", "width_m", "angle_rad")] == pytest.approx([0.01, 0, 0], abs=1e-9)
+    assert {pair["truth"]: pair["id"] for pair in errors["pairs"]} == {k: k + 1 for k in range(len(truth))}
+    assert told["timing"]["detect_s"] > 0
+    assert len(knowing.seen) == 1
+
+
+def test_no_detection_where_none_is_wanted(noisy_session: Session, knowing: Knowing) -> None:
+    told = report(Pipeline(noisy_session.path, ReplayOptions(detect=False)).run())
+    assert told["primitives"] == [] and told["errors"] is None and knowing.seen == []
+
+
+def test_detection_on_the_way_is_on_the_timeline(noisy_session: Session, knowing: Knowing, tmp_path: Path) -> None:
+    viewer = RerunViewer(ViewerOptions(save=tmp_path / "a.rrd"), announce=print)
+    result = replayed(noisy_session, viewer, mapper="prob", detect_every=10)
+    rows = rows_of(tmp_path / "a.rrd")
+    outlines = timed(rows["/map/detections"])
+    wanted = [*range(9, result.scans, 10)]
+    assert sorted({row["scan"] for row in outlines}) == sorted({*wanted, result.scans - 1})
+    labels = value(outlines[0], "labels")
+    assert labels[0] == f"1: {noisy_session.world.primitives[0].kind} 0.90"
+    lengths = value(timed(rows["/errors/lengths"])[-1], "scalars")
+    assert lengths == pytest.approx([10.0, 0.0, 0.0], abs=1e-6)
+    assert value(timed(rows["/errors/found"])[-1], "scalars")[0] == pytest.approx(1.0)
+    assert len(timed(rows["/crops"])) == len(outlines)
+    assert "| 1 |" in value(timed(rows["/detections"])[-1], "text")[0]
+
+
+def test_the_detector_keeps_a_map_of_its_own(noisy_session: Session, knowing: Knowing) -> None:
+    result = replayed(noisy_session, mapper="prob", resolution=0.05, detect_every=12)
+    assert result.grid.frame.resolution == 0.05
+    assert {grid.frame.resolution for grid in knowing.seen} == {0.01} and len(knowing.seen) > 1
+    assert [np.count_nonzero(grid.occupied) for grid in knowing.seen] == sorted(
+        np.count_nonzero(grid.occupied) for grid in knowing.seen
+    )
+
+
+def test_rejected_candidates_are_told_at_verbose(
+    noisy_session: Session, knowing: Knowing, in_tmp: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    command = [str(noisy_session.path), "--weights", "w", "--no-viewer", "--verbose"]
+    assert console.run(cli.app, "prim-replay", command) == 0
+    seen = capsys.readouterr()
+    wanted = "rejected: circle at (0.50, 0.25) m, score 0.10: score 0.10 is below 0.30, the least for a circle"
+    assert wanted in seen.err
+    assert "position 10.0 mm, size 0.0 mm, angle 0.0 deg (means)" in seen.out
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        ({"detect": False, "detect_every": 3}, "--no-detect excludes"),
+        ({"detect": False, "weights": Path("w")}, "--no-detect excludes"),
+        ({"detect_every": 0}, "--detect-every is 0"),
+    ],
+)
+def test_impossible_options(options: dict[str, object], said: str) -> None:
+    with pytest.raises(UsageError, match=said):
+        ReplayOptions(**options)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(("content", "said"), [(b"junk", "no ONNX network"), (b"PK\x03\x04", "pickle")])
+def test_weights_that_cannot_be_used(
+    noisy_session: Session, in_tmp: Path, capsys: pytest.CaptureFixture[str], content: bytes, said: str
+) -> None:
+    Path("w.onnx").write_bytes(content)
+    assert console.run(cli.app, "prim-replay", [str(noisy_session.path), "--weights", "w.onnx"]) == 1
+    error = capsys.readouterr().err
+    assert said in error and error.count("\n") == 1 and not list(Path().glob("*.rrd*"))
