@@ -222,32 +222,54 @@ class StageName(StrEnum):
     CNN = "cnn"
 
 
-class StyleName(StrEnum):
-    """How cells are shown."""
-
-    GREY = "grey"
-    ROUNDED = "rounded"
-
-
 @train.command()
 def export(
     weights: Annotated[Path, typer.Argument(metavar="W.pt", help="What prim-train yolo or prim-train cnn has left.")],
     output: Annotated[Path, typer.Argument(metavar="OUT.onnx", help="The file to make.")],
     stage: Annotated[StageName, typer.Option(help="What the weights are of.")],
     mapper: Annotated[MapperName, typer.Option(help="Whose maps they were trained on.")] = MapperName.FORWARD,
-    style: Annotated[StyleName, typer.Option(help="How cells were shown.")] = StyleName.GREY,
+    data: Annotated[
+        Path | None,
+        typer.Option("--set", metavar="SET", help="What they were trained on: thresholds come from its validation."),
+    ] = None,
     trust: Annotated[bool, typer.Option("--trust", help="YOLO's .pt is a pickle that can run code: run it.")] = False,
     debug: Annotated[bool, typer.Option("--debug", help="Show tracebacks.")] = False,
 ) -> int:
     """Make an ONNX file with a model card of trained weights."""
     need_extra()
+    from detect.dataset import style_of
     from detect.export import export_cnn, export_yolo
+    from detect.recipe import put_thresholds
 
+    style = "grey" if data is None else style_of(data, mapper.value)
     if stage is StageName.CNN:
-        export_cnn(weights, mapper.value, output, style.value)
+        export_cnn(weights, mapper.value, output, style)
     else:
-        export_yolo(weights, mapper.value, output, trust, style.value)
+        export_yolo(weights, mapper.value, output, trust, style)
+        if data is not None:
+            put_thresholds(output, data)
     typer.echo(f"wrote: {output}")
+    return 0
+
+
+@train.command(name="all")
+def every(
+    work: Annotated[Path, typer.Argument(metavar="FOLDER", help="Where sets, training and weights are kept.")],
+    mapper: Annotated[list[MapperName] | None, typer.Option(help="A mapper; repeat. [default: all]")] = None,
+    debug: Annotated[bool, typer.Option("--debug", help="Show tracebacks.")] = False,
+) -> int:
+    """Make the weights that come with prim, from nothing: FOLDER/weights/MAPPER.
+
+    Takes hours, and says how long each part took; an interrupted run goes on.
+    """
+    need_extra()
+    from detect.recipe import MIXED, make_set, make_start, make_weights
+
+    start, data = make_start(work, typer.echo), make_set(work / "mixed", MIXED, typer.echo)
+    about = {"sessions": MIXED.sizes[0], "seed": MIXED.seed, "noise_std_m": MIXED.noise_stds}
+    for name in mapper or list(MapperName):
+        made = make_weights(data, name.value, work / "weights" / name.value, "prim", start, typer.echo, about)
+        typer.echo(f"made: {made}")
     return 0
 
 

@@ -92,12 +92,12 @@ class SetOptions:
 PRESETS = {
     "paper": SetOptions(rounded=("det", "prob")),
     "mixed": SetOptions(
-        sizes=(4000, 400),
+        sizes=(1500, 150),
         seed=200_000,
         noise_stds=(0.0, 0.02, 0.05, 0.075, 0.1, 0.25, 0.375, 0.5),
         rays=(180, 360, 500, 1000),
         stops=(6, 8, 10),
-        floors=(2.0, 2.0, 3.0, 5.0),
+        floors=(2.0, 2.0, 2.0, 3.0),
         motions=("warp", "warp", "drive"),
         walled=0.7,
     ),
@@ -285,6 +285,15 @@ def samples(folder: Path, mapper: str, split: str) -> list[Sample]:
     if not paths or not (folder / f"{mapper}.yaml").exists():
         raise UsageError(f"{folder} holds no {split} set for {mapper}: make one with prim-train dataset")
     return [_sample(folder, mapper, split, path) for path in paths]
+
+
+def style_of(folder: Path, mapper: str) -> str:
+    """How a set's images show a mapper's cells (detect.tiles.STYLES). Raises UsageError where there is no set."""
+    try:
+        manifest = json.loads((folder / "manifest.json").read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        raise UsageError(f"{folder} holds no set: make one with prim-train dataset") from error
+    return "rounded" if mapper in manifest.get("rounded", ()) else "grey"
 
 
 def _sample(folder: Path, mapper: str, split: str, path: Path) -> Sample:

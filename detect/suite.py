@@ -14,18 +14,18 @@ Noise has two readings (DESIGN: n is a share of 5 m as written, of 1 m as the pa
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from detect.dataset import PRESETS, SetOptions, make, samples
+from detect.dataset import PRESETS, SetOptions, samples
 from detect.detector import Detector
-from detect.evaluate import choose_thresholds, evaluate
+from detect.evaluate import evaluate
 from detect.paper import ROWS, Row
 from detect.parameters import PAPER
-from detect.weights import DETECTOR, load_weights
-from detect.yolo import Yolo
+from detect.recipe import Say, make_set, make_start, make_weights
+from detect.weights import DETECTOR
 from prim.errors import OutputError
 from prim.shapes import Kind
 
@@ -37,8 +37,6 @@ TESTING = SetOptions(sizes=(0, 125), seed=150_000, rounded=PRESETS["paper"].roun
 SINGLE = SetOptions(sizes=(0, 50), seed=160_000, rounded=PRESETS["paper"].rounded)
 SINGLE_STEP = 1000
 """Sets of one kind have seeds this far apart."""
-
-Say = Callable[[str], None]
 
 
 @dataclass(frozen=True)
@@ -109,50 +107,11 @@ class Suite:
     def networks(self, case: Case) -> Path:
         """The folder of a case's networks, trained."""
         folder = self.work / "networks" / case.network
-        if not (folder / DETECTOR).exists():
-            from detect.train import CNN_PRESETS, YOLO_PRESETS, checkpoint_name, networks_of, train_cnn, train_yolo
-
-            mapper = case.row.mapper
-            data = self.training(case.train_mm)
-            folder.mkdir(parents=True, exist_ok=True)
-            for kinds in networks_of(PAPER.name, list(Kind)):
-                self.say(f"training {case.network}: {kinds[0]}")
-                train_cnn(data, mapper, kinds, folder / checkpoint_name(mapper, kinds), CNN_PRESETS["paper"])
-            self.say(f"training {case.network}: YOLO")
-            options = replace(YOLO_PRESETS["paper"], start=self.start(), trust=True)
-            self._export(case, train_yolo(data, mapper, folder / "yolo", options))
-        return folder
-
-    def _export(self, case: Case, weights: Path) -> None:
-        """Makes ONNX files of a case's trained networks; YOLO's last, with thresholds."""
-        from detect.export import export_cnn, export_yolo, write_card
-        from detect.train import checkpoint_name, networks_of
-
-        folder, mapper, options = self.work / "networks" / case.network, case.row.mapper, TRAINING
-        style = "rounded" if mapper in options.rounded else "grey"
-        about = {
-            "suite": "paper",
-            "noise_std_m": case.train_mm / 1000,
-            "maps": options.sizes[0],
-            "seed": options.seed,
-        }
-        for kinds in networks_of(PAPER.name, list(Kind)):
-            checkpoint = folder / checkpoint_name(mapper, kinds)
-            export_cnn(checkpoint, mapper, folder / f"cnn.{kinds[0]}.onnx", style, about)
-        part = folder / "yolo.part"
-        card = export_yolo(weights, mapper, part, True, style, about)
-        validation = samples(self.training(case.train_mm), mapper, "val")
-        write_card(part, replace(card, thresholds=choose_thresholds(Yolo(load_weights(part, "yolo")), validation)))
-        part.replace(folder / DETECTOR)
-
-    def start(self) -> Path:
-        """Weights that training begins from."""
-        from detect.drawings import NAME, DrawingOptions, make_drawings
-        from detect.train import YOLO_PRESETS, train_yolo
-
-        self.say("training on drawings: YOLO")
-        make_drawings(self.work / NAME, DrawingOptions())
-        return train_yolo(self.work / NAME, NAME, self.work / "start", YOLO_PRESETS[NAME])
+        if (folder / DETECTOR).exists():
+            return folder
+        about = {"maps": TRAINING.sizes[0], "seed": TRAINING.seed, "noise_std_m": case.train_mm / 1000}
+        data, start = self.training(case.train_mm), make_start(self.work, self.say)
+        return make_weights(data, case.row.mapper, folder, PAPER.name, start, self.say, about)
 
     def training(self, noise_mm: int) -> Path:
         """A set to train on."""
@@ -168,9 +127,7 @@ class Suite:
         return self._made(name, replace(options, noise_stds=(int(noise_mm) / 1000,)))
 
     def _made(self, name: str, options: SetOptions) -> Path:
-        self.say(f"making {name}: {sum(options.sizes)} maps")
-        make(self.work / name, options)
-        return self.work / name
+        return make_set(self.work / name, options, self.say)
 
 
 def write(path: Path, text: str) -> None:

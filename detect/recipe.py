@@ -1,0 +1,92 @@
+"""From a set to a folder of weights: the steps that the paper's suite and the shipped weights share.
+
+FOLDER/yolo/  FOLDER/cnn.MAPPER[.KIND].pt     training, which an interrupted run goes on with
+FOLDER/yolo.onnx  FOLDER/cnn*.onnx            what it ends with: see detect.weights.load_set
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from detect.dataset import PRESETS, SetOptions, make, samples, style_of
+from detect.drawings import NAME, DrawingOptions, make_drawings
+from detect.evaluate import choose_thresholds
+from detect.weights import DETECTOR, load_weights
+from detect.yolo import Yolo
+from prim.shapes import Kind
+
+MIXED = PRESETS["mixed"]
+"""What shipped weights are trained on."""
+
+WORTH_SAYING = 5.0
+"""What takes no longer than this (s) was there already."""
+
+Say = Callable[[str], None]
+
+
+@contextmanager
+def _timed(what: str, say: Say) -> Iterator[None]:
+    """Says how long a part took, where it took a while."""
+    began = time.monotonic()
+    yield
+    took = time.monotonic() - began
+    if took > WORTH_SAYING:
+        say(f"{what}: {took / 60:.1f} min")
+
+
+def make_start(work: Path, say: Say) -> Path:
+    """YOLO's weights after some epochs on drawings, where COCO's would stand: ``work/start``."""
+    from detect.train import YOLO_PRESETS, train_yolo
+
+    with _timed("drawings", say):
+        make_drawings(work / NAME, DrawingOptions())
+    with _timed("YOLO on drawings", say):
+        return train_yolo(work / NAME, NAME, work / "start", YOLO_PRESETS[NAME])
+
+
+def make_set(folder: Path, options: SetOptions, say: Say) -> Path:
+    """A set in a folder of its own."""
+    with _timed(f"{folder.name}: {sum(options.sizes)} sessions", say):
+        make(folder, options)
+    return folder
+
+
+def make_weights(
+    data: Path, mapper: str, folder: Path, preset: str, start: Path, say: Say, about: Mapping[str, Any] | None = None
+) -> Path:
+    """Trains all networks on a set, with thresholds from its validation split; what is there is not made again."""
+    if (folder / DETECTOR).exists():
+        return folder
+    from detect.export import export_cnn, export_yolo
+    from detect.train import CNN_PRESETS, YOLO_PRESETS, checkpoint_name, networks_of, train_cnn, train_yolo
+
+    folder.mkdir(parents=True, exist_ok=True)
+    style = style_of(data, mapper)
+    for kinds in networks_of(preset, list(Kind)):
+        name = "cnn" if len(kinds) == len(Kind) else f"cnn.{'-'.join(kinds)}"
+        checkpoint = folder / checkpoint_name(mapper, kinds)
+        with _timed(f"{folder.name}: {name}", say):
+            train_cnn(data, mapper, kinds, checkpoint, CNN_PRESETS[preset])
+        export_cnn(checkpoint, mapper, folder / f"{name}.onnx", style, about)
+    with _timed(f"{folder.name}: YOLO", say):
+        options = replace(YOLO_PRESETS[preset], start=start, trust=True)
+        best = train_yolo(data, mapper, folder / "yolo", options)
+    part = folder / "yolo.part"
+    export_yolo(best, mapper, part, True, style, about)
+    put_thresholds(part, data)
+    part.replace(folder / DETECTOR)
+    return folder
+
+
+def put_thresholds(yolo: Path, data: Path) -> None:
+    """Chooses a YOLO's thresholds on a set's validation split and puts them into its card."""
+    from detect.export import write_card
+
+    weights = load_weights(yolo, "yolo")
+    chosen = choose_thresholds(Yolo(weights), samples(data, weights.card.mapper, "val"))
+    write_card(yolo, replace(weights.card, thresholds=chosen))
