@@ -230,7 +230,7 @@ def export(
     mapper: Annotated[MapperName, typer.Option(help="Whose maps they were trained on.")] = MapperName.FORWARD,
     data: Annotated[
         Path | None,
-        typer.Option("--set", metavar="SET", help="What they were trained on: thresholds come from its validation."),
+        typer.Option("--set", metavar="SET", help="The set YOLO was trained on: its thresholds are chosen there."),
     ] = None,
     trust: Annotated[bool, typer.Option("--trust", help="YOLO's .pt is a pickle that can run code: run it.")] = False,
     debug: Annotated[bool, typer.Option("--debug", help="Show tracebacks.")] = False,
@@ -241,13 +241,13 @@ def export(
     from detect.export import export_cnn, export_yolo
     from detect.recipe import put_thresholds
 
-    style = "grey" if data is None else style_of(data, mapper.value)
     if stage is StageName.CNN:
-        export_cnn(weights, mapper.value, output, style)
+        export_cnn(weights, mapper.value, output)
     else:
-        export_yolo(weights, mapper.value, output, trust, style)
-        if data is not None:
-            put_thresholds(output, data)
+        if data is None:
+            raise UsageError("YOLO's thresholds are chosen on the set it was trained on: name it with --set")
+        export_yolo(weights, mapper.value, output, trust, style_of(data, mapper.value))
+        put_thresholds(output, data)
     typer.echo(f"wrote: {output}")
     return 0
 

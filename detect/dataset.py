@@ -92,7 +92,7 @@ class SetOptions:
 PRESETS = {
     "paper": SetOptions(rounded=("det", "prob")),
     "mixed": SetOptions(
-        sizes=(1500, 150),
+        sizes=(600, 60),
         seed=200_000,
         noise_stds=(0.0, 0.02, 0.05, 0.075, 0.1, 0.25, 0.375, 0.5),
         rays=(180, 360, 500, 1000),
@@ -232,9 +232,10 @@ def map_scans(mapper: str, scans: Sequence[tuple[Scan, Pose2D]], resolution: flo
 
 def share_inside(primitive: Primitive, tile: GridFrame) -> float:
     """The share of a primitive's outline that lies within a tile."""
-    x0, y0, x1, y1 = tile.bounds
-    x, y = primitive.outline().T
-    return float(np.mean((x >= x0) & (x <= x1) & (y >= y0) & (y <= y1)))
+    import shapely
+
+    outline = shapely.LinearRing(primitive.outline())
+    return float(outline.intersection(shapely.box(*tile.bounds)).length / outline.length)
 
 
 def yolo_line(primitive: Primitive, tile: GridFrame) -> str:

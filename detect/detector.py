@@ -37,10 +37,13 @@ BATCH = 8
 
 @dataclass(frozen=True)
 class Detection:
-    """A primitive with its ``score`` (0 to 1) and the ``crop`` (pixels, pixels) its parameters were read from."""
+    """A primitive with its ``score`` (0 to 1), YOLO's ``box`` (m: x0, y0, x1, y1), and the ``crop`` (pixels, pixels)
+    that its parameters were read from.
+    """
 
     primitive: Primitive
     score: float
+    box: tuple[float, float, float, float]
     crop: NDArray[np.uint8]
 
 
@@ -108,16 +111,22 @@ class Detector:
         looked = list(self._look(images))
         boxes = Boxes.joined([one.boxes for one in looked])
         of = [one for one in looked for _ in range(len(one.boxes))]
-        whole = [_is_whole(box, one.tile, frame) for box, one in zip(boxes.box, of, strict=True)]
-        better = suppress(boxes, OVERLAP_LIMIT, among=np.array(whole, dtype=bool))
-        reasons = [self._reason(boxes, i, by) for i, by in enumerate(better.tolist())]
-        kept = [i for i, reason in enumerate(reasons) if reason is None]
+        least = np.array([self.thresholds[KINDS[kind]] for kind in boxes.kind.tolist()], np.float32)
+        whole = np.array(
+            [_is_whole(box, one.tile, frame) for box, one in zip(boxes.box, of, strict=True)], dtype=bool
+        )
+        better = _suppressed(boxes, whole & (boxes.score >= least), [len(one.boxes) for one in looked])
+        kept = np.flatnonzero(better == np.arange(len(boxes))).tolist()
         found = [_found(of[i], boxes, i) for i in kept]
         detections = (
-            Detection(primitive, float(boxes.score[i]), self.estimator.crop(one))
+            Detection(primitive, float(boxes.score[i]), _metres(boxes, i, frame), self.estimator.crop(one))
             for i, one, primitive in zip(kept, found, self.estimator(found), strict=True)
         )
-        rejections = (_rejection(boxes, i, frame.resolution, reason) for i, reason in enumerate(reasons) if reason)
+        rejections = (
+            _rejection(boxes, i, frame, self._reason(boxes, i, by, bool(whole[i])))
+            for i, by in enumerate(better.tolist())
+            if by != i
+        )
         return Detections(_best_first(detections), _best_first(rejections))
 
     def _look(self, images: Iterable[tuple[GridFrame, NDArray[np.uint8]]]) -> Iterator[_Looked]:
@@ -129,16 +138,29 @@ class Detector:
                 if len(seen):
                     yield _Looked(tile, np.ascontiguousarray(image[..., 0]), seen.moved(tile.col, tile.row))
 
-    def _reason(self, boxes: Boxes, i: int, by: int) -> str | None:
-        """Why a candidate is no detection; None where it is one."""
-        kind, score = KINDS[boxes.kind[i]], float(boxes.score[i])
-        if by < 0:
-            return f"within {EDGE} cells of its tile's border: the next tile holds it whole"
-        if by != i:
+    def _reason(self, boxes: Boxes, i: int, by: int, whole: bool) -> str:
+        """Why a candidate is no detection."""
+        if by >= 0:
             return f"overlaps a better {KINDS[boxes.kind[by]]} by more than {OVERLAP_LIMIT:g} (IoU)"
-        if score < self.thresholds[kind]:
-            return f"score {score:.2f} is below {self.thresholds[kind]:.2f}, the least for a {kind}"
-        return None
+        if not whole:
+            return f"within {EDGE} cells of its tile's border: the next tile holds it whole"
+        kind = KINDS[boxes.kind[i]]
+        return f"score {boxes.score[i]:.2f} is below {self.thresholds[kind]:.2f}, the least for a {kind}"
+
+
+def _suppressed(boxes: Boxes, among: NDArray[np.bool_], per_tile: Sequence[int]) -> NDArray[np.intp]:
+    """As :func:`suppress`: within each tile first, and then what is left across their seams."""
+    by = np.full(len(boxes), -1, np.intp)
+    first = 0
+    for count in per_tile:
+        own = np.arange(first, first + count)
+        inner = suppress(boxes[own], OVERLAP_LIMIT, among=among[own])
+        by[own] = np.where(inner >= 0, inner + first, -1)
+        first += count
+    left = np.flatnonzero(by == np.arange(len(boxes)))
+    if len(per_tile) > 1:
+        by[left] = left[suppress(boxes[left], OVERLAP_LIMIT)]
+    return by
 
 
 def _found(looked: _Looked, boxes: Boxes, i: int) -> Found:
@@ -178,7 +200,12 @@ def _is_whole(box: NDArray[np.float32], tile: GridFrame, frame: GridFrame) -> bo
     return not any(cut_off)
 
 
-def _rejection(boxes: Boxes, i: int, resolution: float, reason: str) -> Rejection:
-    left, top, right, bottom = (float(value) for value in boxes.box[i])
-    x, y = (left + right) / 2 * resolution, (top + bottom) / 2 * resolution
-    return Rejection(KINDS[boxes.kind[i]], float(boxes.score[i]), x, y, reason)
+def _metres(boxes: Boxes, i: int, frame: GridFrame) -> tuple[float, float, float, float]:
+    """A candidate's box in metres."""
+    left, bottom, right, top = (float(value) * frame.resolution for value in boxes.box[i])
+    return left, bottom, right, top
+
+
+def _rejection(boxes: Boxes, i: int, frame: GridFrame, reason: str) -> Rejection:
+    left, bottom, right, top = _metres(boxes, i, frame)
+    return Rejection(KINDS[boxes.kind[i]], float(boxes.score[i]), (left + right) / 2, (bottom + top) / 2, reason)

@@ -46,6 +46,8 @@ class Estimator:
             if not chosen:
                 continue
             outputs = network.run(np.stack([self.crop(found[i]) for i in chosen]))
+            if not np.isfinite(outputs).all():
+                raise WeightsError(f"{network.weights.path} gives no numbers for a crop: make it anew")
             for i, row in zip(chosen, outputs.tolist(), strict=True):
                 one = found[i]
                 own = row[network.preset.span(network.kinds, one.kind)]

@@ -67,15 +67,15 @@ def make_weights(
 
     folder.mkdir(parents=True, exist_ok=True)
     style = style_of(data, mapper)
+    with _timed(f"{folder.name}: YOLO", say):
+        options = replace(YOLO_PRESETS[preset], start=start, trust=True)
+        best = train_yolo(data, mapper, folder / "yolo", options)
     for kinds in networks_of(preset, list(Kind)):
         name = "cnn" if len(kinds) == len(Kind) else f"cnn.{'-'.join(kinds)}"
         checkpoint = folder / checkpoint_name(mapper, kinds)
         with _timed(f"{folder.name}: {name}", say):
             train_cnn(data, mapper, kinds, checkpoint, CNN_PRESETS[preset])
-        export_cnn(checkpoint, mapper, folder / f"{name}.onnx", style, about)
-    with _timed(f"{folder.name}: YOLO", say):
-        options = replace(YOLO_PRESETS[preset], start=start, trust=True)
-        best = train_yolo(data, mapper, folder / "yolo", options)
+        export_cnn(checkpoint, mapper, folder / f"{name}.onnx", about)
     part = folder / "yolo.part"
     export_yolo(best, mapper, part, True, style, about)
     put_thresholds(part, data)

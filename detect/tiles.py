@@ -13,8 +13,8 @@ from mapping.grid import UNKNOWN_GREY, GridFrame, OccupancyGrid
 TILE = 224
 """Side of an image in cells: a multiple of 32, as YOLO wants it, and enough for the paper's 2 x 2 m and a margin."""
 
-OVERLAP = 64
-"""Tiles of a larger map overlap by this many cells: more than any primitive is wide."""
+OVERLAP = 80
+"""Tiles of a larger map overlap by this many cells: a third more than any primitive is wide."""
 
 STYLES = ("grey", "rounded")
 """How cells are shown: ``grey`` is OccupancyGrid.image; ``rounded`` is the paper's (III-A): occupied, free or

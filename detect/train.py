@@ -5,10 +5,12 @@ Needs the extra ``[train]`` (torch, ultralytics). Nothing that replays imports t
 
 from __future__ import annotations
 
+import json
 import os
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
+from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +18,7 @@ import numpy as np
 import torch
 
 from detect.crops import Crops, gather
-from detect.dataset import samples
+from detect.dataset import samples, style_of
 from detect.networks import ParameterNetwork
 from detect.parameters import PAPER, PRESETS, PRIM, targets
 from prim.errors import UsageError
@@ -86,13 +88,20 @@ def train_cnn(
     network = ParameterNetwork(kinds, PRESETS[options.preset], options.channels)
     optimizer = torch.optim.Adam(network.parameters(), lr=options.learning_rate)
     schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, options.epochs)
-    first = _resume(output, options, network, optimizer, schedule)
+    asked = {
+        "options": asdict(options),
+        "kinds": [kind.value for kind in kinds],
+        "mapper": mapper,
+        "style": style_of(data, mapper),
+        "set": json.dumps(_manifest(data)),
+    }
+    first = _resume(output, asked, network, optimizer, schedule)
     for epoch in range(first, options.epochs):
         rng = np.random.default_rng((options.seed, epoch))
         loss = _epoch(network, optimizer, training, options, rng)
         if options.vary:
             schedule.step()
-        _keep(output, options, network, optimizer, schedule, epoch + 1)
+        _keep(output, asked, network, optimizer, schedule, epoch + 1)
         if progress:
             progress(epoch + 1, options.epochs, loss, evaluate_cnn(network, validation))
     network.eval()
@@ -166,12 +175,10 @@ def as_input(pairs: Sequence[tuple[Any, Any]], channels: int) -> torch.Tensor:
     return grey.expand(-1, channels, -1, -1)
 
 
-def _keep(output: Path, options: CnnOptions, network: Any, optimizer: Any, schedule: Any, epochs: int) -> None:
+def _keep(output: Path, asked: dict[str, Any], network: Any, optimizer: Any, schedule: Any, epochs: int) -> None:
     """Writes a checkpoint; whole, or not at all."""
     part = output.with_suffix(".part")
-    state = {
-        "options": asdict(options),
-        "kinds": [kind.value for kind in network.kinds],
+    state = asked | {
         "epochs": epochs,
         "network": network.state_dict(),
         "optimizer": optimizer.state_dict(),
@@ -181,13 +188,13 @@ def _keep(output: Path, options: CnnOptions, network: Any, optimizer: Any, sched
     part.replace(output)
 
 
-def _resume(output: Path, options: CnnOptions, network: Any, optimizer: Any, schedule: Any) -> int:
+def _resume(output: Path, asked: dict[str, Any], network: Any, optimizer: Any, schedule: Any) -> int:
     """Takes over a checkpoint where there is one; returns how many epochs it has seen."""
     if not output.exists():
         return 0
     state = torch.load(output, weights_only=True)
-    if state["options"] != asdict(options) or state["kinds"] != [kind.value for kind in network.kinds]:
-        raise UsageError(f"{output} was trained with other options: give another file")
+    if {name: state.get(name) for name in asked} != asked:
+        raise UsageError(f"{output} was trained on another set or with other options: give another file")
     network.load_state_dict(state["network"])
     optimizer.load_state_dict(state["optimizer"])
     schedule.load_state_dict(state["schedule"])
@@ -220,7 +227,7 @@ class YoloOptions:
 YOLO_PRESETS = {
     "prim": YoloOptions(),
     "paper": YoloOptions(epochs=32, image_size=224, optimizer="SGD", learning_rate=0.01, turn=False),
-    "drawings": YoloOptions(epochs=4, mosaic=False, turn=False),
+    "drawings": YoloOptions(epochs=3, mosaic=False, turn=False),
 }
 """Ours; the paper's (IV-B: 32 epochs, batch 32, SGD, learning rate 0.01); and one for detect.drawings, which vary."""
 
@@ -231,7 +238,7 @@ def train_yolo(data: Path, mapper: str, output: Path, options: YoloOptions) -> P
     Images are moved, scaled and mirrored, and put together in fours (``mosaic``), as YOLOv5's own settings have it;
     with ``turn`` they are turned by any angle as well; they are never coloured: a map has no colours to vary.
 
-    Raises UsageError where the set is missing.
+    Raises UsageError where the set is missing, or ``output`` holds a run of another set or other options.
     """
     config = data / f"{mapper}.yaml"
     if not config.exists():
@@ -240,20 +247,41 @@ def train_yolo(data: Path, mapper: str, output: Path, options: YoloOptions) -> P
     from ultralytics import YOLO, settings
 
     settings.update({"sync": False})
-    best = output / "weights" / "best.pt"
-    if (output / FINISHED).exists():
-        return best
-    last = output / "weights" / "last.pt"
-    with fast_arithmetic():
-        if last.exists():
-            YOLO(str(last)).train(resume=True, trainer=_trainer())
-        else:
-            model = YOLO(options.model)
-            if options.start is not None:
-                model.load(str(options.start))
-            _fit_yolo(model, config, output, options)
-    (output / FINISHED).touch()
+    _claim(output, {"mapper": mapper, "set": _manifest(data), "options": _plain(asdict(options))})
+    best, last = (output / "weights" / name for name in ("best.pt", "last.pt"))
+    if not (output / FINISHED).exists():
+        with fast_arithmetic():
+            if not last.exists():
+                _fit_yolo(YOLO(options.model), config, output, options)
+            elif not _is_stripped(last):
+                YOLO(str(last)).train(resume=True, trainer=_trainer())
+        (output / FINISHED).touch()
     return best
+
+
+def _claim(output: Path, asked: dict[str, Any]) -> None:
+    """Writes what a run was asked for beside it. Raises UsageError where it was asked for something else before."""
+    path = output / "asked.json"
+    text = json.dumps(asked, indent=1) + "\n"
+    if path.exists() and path.read_text(encoding="utf-8") != text:
+        raise UsageError(f"{output} was trained on another set or with other options: give another folder")
+    output.mkdir(parents=True, exist_ok=True)
+    path.write_text(text, encoding="utf-8")
+
+
+def _manifest(data: Path) -> Any:
+    return json.loads((data / "manifest.json").read_text(encoding="utf-8"))
+
+
+def _plain(options: dict[str, Any]) -> dict[str, Any]:
+    """Options as JSON holds them; weights to begin from by their content, wherever they lie."""
+    start = options["start"]
+    return options | {"start": start and sha256(Path(start).read_bytes()).hexdigest()}
+
+
+def _is_stripped(checkpoint: Path) -> bool:
+    """Whether a run has come to its end and lost what it could go on with; our own file, read as ultralytics does."""
+    return int(torch.load(checkpoint, weights_only=False, map_location="cpu")["epoch"]) < 0
 
 
 def _fit_yolo(model: Any, config: Path, output: Path, options: YoloOptions) -> None:
@@ -273,7 +301,7 @@ def _fit_yolo(model: Any, config: Path, output: Path, options: YoloOptions) -> N
         project=str(output.parent.resolve()),
         name=output.name,
         exist_ok=True,
-        pretrained=False,
+        pretrained=str(options.start) if options.start else False,
         plots=False,
         verbose=False,
         hsv_h=0.0,

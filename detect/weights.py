@@ -9,6 +9,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from detect.tiles import STYLES
 from prim.errors import PrimError
 from prim.shapes import Kind
 
@@ -67,9 +68,19 @@ class Card:
             card = cls(**value | {"kinds": tuple(value.get("kinds", ALL_KINDS))})
         except TypeError as error:
             raise ValueError(str(error)) from error
-        if card.stage not in STAGES or not set(card.kinds) <= set(ALL_KINDS):
-            raise ValueError("an unknown stage or kind")
+        card._check()
         return card
+
+    def _check(self) -> None:
+        """Raises ValueError on what no card of ours says."""
+        known = self.stage in STAGES and self.style in STYLES and all(kind in ALL_KINDS for kind in self.kinds)
+        if not known or not isinstance(self.mapper, str) or self.channels not in (1, 3):
+            raise ValueError("an unknown stage, kind, style, mapper or number of channels")
+        if not isinstance(self.resolution, float) or not self.resolution > 0:
+            raise ValueError("a resolution that is none")
+        scores = self.thresholds.values() if isinstance(self.thresholds, Mapping) else [None]
+        if not all(isinstance(score, float) and 0 <= score <= 1 for score in scores):
+            raise ValueError("thresholds that are none")
 
 
 @dataclass(frozen=True)
@@ -116,13 +127,21 @@ def load_weights(path: Path, stage: str, mapper: str | None = None, threads: int
 def load_set(path: Path, mapper: str | None = None, threads: int | None = None) -> tuple[Weights, list[Weights]]:
     """Opens a YOLO and the networks that read parameters beside it: a folder, or the YOLO's own file in it.
 
-    Raises WeightsError as :func:`load_weights`, and where a kind's network is missing.
+    Raises WeightsError as :func:`load_weights`, and where a kind's network is missing, there twice, or does not go
+    with the YOLO.
     """
     detector = path / DETECTOR if path.is_dir() else path
     yolo = load_weights(detector, "yolo", mapper, threads)
     others = sorted(other for other in detector.parent.glob("*.onnx") if other.name != detector.name)
     networks = [load_weights(other, "cnn", yolo.card.mapper, threads) for other in others]
-    missing = set(ALL_KINDS).difference(*(network.card.kinds for network in networks))
+    for network in networks:
+        if (network.card.style, network.card.resolution) != (yolo.card.style, yolo.card.resolution):
+            raise WeightsError(f"{network.path} reads other images than {yolo.path}: they are of different sets")
+    kinds = [kind for network in networks for kind in network.card.kinds]
+    twice = [kind for kind in ALL_KINDS if kinds.count(kind) > 1]
+    if twice:
+        raise WeightsError(f"{detector.parent} holds several networks for: {', '.join(twice)}; keep one of each")
+    missing = set(ALL_KINDS).difference(kinds)
     if missing:
         what = ", ".join(sorted(missing))
         raise WeightsError(f"{detector.parent} holds no network that reads the parameters of: {what}")

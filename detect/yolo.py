@@ -17,6 +17,9 @@ KINDS = tuple(Kind)
 
 CHANNELS = 3
 
+MANY = 3000
+"""From so many candidates on, suppression looks at neighbours only."""
+
 BoxArray = NDArray[np.float32]
 """(N, 4): left, top, right, bottom in cells; row 0 at the top."""
 
@@ -112,6 +115,8 @@ def suppress(
     order = np.argsort(-boxes.score, kind="stable")
     if among is not None:
         order = order[among[order]]
+    if len(order) > MANY:
+        return _suppress_many(boxes, limit, per_kind, order, by)
     while len(order):
         best, rest = order[0], order[1:]
         by[best] = best
@@ -120,4 +125,25 @@ def suppress(
             gone &= boxes.kind[rest] == boxes.kind[best]
         by[rest[gone]] = best
         order = rest[~gone]
+    return by
+
+
+def _suppress_many(
+    boxes: Boxes, limit: float, per_kind: bool, order: NDArray[np.intp], by: NDArray[np.intp]
+) -> NDArray[np.intp]:
+    """The same for so many that not each can be held against all: only what lies near is looked at."""
+    side = float((boxes.box[order, 2:] - boxes.box[order, :2]).max())
+    places = np.floor(boxes.box[:, :2] / max(side, 1.0)).astype(int).tolist()
+    kept: dict[tuple[int, int], list[int]] = {}
+    for i in order.tolist():
+        col, row = places[i]
+        near = [k for c in (-1, 0, 1) for r in (-1, 0, 1) for k in kept.get((col + c, row + r), ())]
+        if per_kind:
+            near = [k for k in near if boxes.kind[k] == boxes.kind[i]]
+        over = np.flatnonzero(overlap(boxes.box[i], boxes.box[near]) > limit) if near else ()
+        if len(over):
+            by[i] = max((near[k] for k in over), key=lambda k: boxes.score[k])
+        else:
+            by[i] = i
+            kept.setdefault((col, row), []).append(i)
     return by

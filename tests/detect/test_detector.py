@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from detect.detector import BATCH, Detector
 from detect.estimator import Estimator
@@ -51,11 +53,29 @@ def test_a_blob_becomes_a_primitive_where_it_lies() -> None:
 
 def test_every_rejected_candidate_says_by_which_threshold() -> None:
     found = detector({"circle": 0.95}).detect(grid_with((0.7, 1.3)))
-    assert not found.found and len(found.rejected) == 2
-    low, double = found.rejected
-    assert low.reason == "score 0.90 is below 0.95, the least for a circle"
-    assert double.reason == "overlaps a better circle by more than 0.45 (IoU)"
+    assert not found.found
+    low, lower = found.rejected
+    assert low.reason == "score 0.90 is below 0.95, the least for a circle" and lower.score == pytest.approx(0.4)
     assert (low.x, low.y) == pytest.approx((0.7, 1.3), abs=0.006)
+    (double,) = detector({"circle": 0.3}).detect(grid_with((0.7, 1.3))).rejected
+    assert double.reason == "overlaps a better circle by more than 0.45 (IoU)"
+
+
+def test_what_is_rejected_suppresses_nothing() -> None:
+    """A circle below its threshold lies on an ellipse above its own: the ellipse is found."""
+
+    def answer(batch: np.ndarray) -> np.ndarray:
+        output = np.zeros((len(batch), 9, 2), np.float32)
+        output[:, :4] = np.array([50, 60, 20, 20], np.float32)[None, :, None]
+        output[:, 4 + 2, 0], output[:, 4 + 4, 1] = 0.55, 0.5
+        return output
+
+    made = detector()
+    made.yolo = Yolo(weights(Card("yolo", "det"), answer))
+    made.thresholds |= {Kind.CIRCLE: 0.6, Kind.ELLIPSE: 0.3}
+    found = made.detect(grid_with((0.7, 1.3)))
+    assert [one.primitive.kind for one in found.found] == [Kind.ELLIPSE]
+    assert [one.reason[:10] for one in found.rejected] == ["score 0.55"]
 
 
 def test_one_primitive_on_the_seam_of_tiles_is_found_once() -> None:
@@ -110,3 +130,18 @@ def test_suppression_by_hand() -> None:
     assert suppress(boxes, 0.5).tolist() == [1, 1, 2, 1]
     assert suppress(boxes, 0.5, per_kind=True).tolist() == [1, 1, 2, 3]
     assert suppress(boxes, 0.5, among=np.array([True, False, True, True])).tolist() == [3, -1, 2, 3]
+
+
+@given(st.integers(0, 2**31), st.booleans())
+def test_many_are_suppressed_as_few_are(seed: int, per_kind: bool) -> None:
+    rng = np.random.default_rng(seed)
+    corner, side = rng.uniform(-200, 200, (60, 2)), rng.uniform(5, 60, (60, 2))
+    boxes = Boxes(
+        np.concatenate((corner, corner + side), axis=1).astype(np.float32),
+        rng.integers(0, 3, 60),
+        rng.permutation(60).astype(np.float32) / 60,
+    )
+    few = suppress(boxes, 0.3, per_kind)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("detect.yolo.MANY", 10)
+        assert suppress(boxes, 0.3, per_kind).tolist() == few.tolist()

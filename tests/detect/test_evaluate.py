@@ -86,7 +86,9 @@ def test_the_papers_rows_stand_for_themselves_and_for_forward() -> None:
 def made_up(row: float) -> dict[str, Any]:
     """An evaluation."""
     scores = dict.fromkeys(("f1", "map50", "map50_95", "auc", "confidence"), row)
-    errors = dict.fromkeys(("angle", "median_angle", "width", "height", "size", "position"), 0.01) | {"count": 9}
+    errors = dict.fromkeys(("angle", "median_angle", "clear_angle", "width", "height", "size", "position"), 0.01) | {
+        "count": 9
+    }
     return {
         "boxes": dict.fromkeys(SHAPES, scores), "true_boxes": dict.fromkeys(SHAPES, errors), "detected": {},
         "found": [0, 0, 0], "kind_accuracy": None, "yolo_time": 0.005, "parameters_time": 0.01, "whole_time": 0.02,

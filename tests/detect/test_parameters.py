@@ -114,7 +114,7 @@ def test_tiles_cover_and_overlap() -> None:
         covered[max(tile.row - frame.row, 0) :, max(tile.col - frame.col, 0) :][: tile.rows, : tile.cols] = True
     assert covered.all()
     rows = sorted({tile.row for tile in found})
-    assert max(np.diff(rows)) <= TILE - 64
+    assert max(np.diff(rows)) <= TILE - 80
     single = next(tiles(GridFrame(0.01, -110, -110, 220, 220)))
     assert (single.row, single.col) == (-112, -112)
 
@@ -128,6 +128,10 @@ def test_a_tile_beyond_the_map_is_unknown() -> None:
 
 def test_share_inside() -> None:
     circle = Primitive(Kind.CIRCLE, 1.12, 0.0, None, (0.1,))
-    assert share_inside(circle, FRAME) == pytest.approx(0.5, abs=0.05)
+    assert share_inside(circle, FRAME) == pytest.approx(0.5, abs=0.01)
+    inside_but_for_2_mm = Primitive(Kind.SQUARE, 1.12 - 0.1 + 0.002, 0.0, 0.0, (0.2,))
+    assert share_inside(inside_but_for_2_mm, FRAME) == pytest.approx(0.745, abs=0.001)
+    only_its_base = Primitive(Kind.TRIANGLE, 1.12 + 0.09, 0.0, -np.pi / 2, (0.2, 0.3))
+    assert share_inside(only_its_base, FRAME) == pytest.approx(0.266, abs=0.001)
     assert math.isclose(share_inside(SHAPES[0], FRAME), 1.0)
     assert World((2, 2), ()).bounds == (-1, -1, 1, 1)

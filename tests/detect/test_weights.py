@@ -65,7 +65,11 @@ def test_an_exported_network_gives_torch_s_numbers(tmp_path: Path, preset: str, 
     crops = np.random.default_rng(0).random((5, 1, *[PRESETS[preset].pixels] * 2), dtype=np.float32)
     outputs = weights.session.run(None, {"crops": crops})[0]
     with torch.no_grad():
-        assert outputs == pytest.approx(network(torch.from_numpy(crops)).numpy(), abs=1e-5)
+        wanted = network(torch.from_numpy(crops)).numpy()
+    assert outputs == pytest.approx(wanted, abs=2e-3)  # weights are kept in half precision
+    assert np.corrcoef(outputs.ravel(), wanted.ravel())[0, 1] > 0.999
+    whole = 4 * sum(parameter.numel() for parameter in network.parameters())
+    assert (tmp_path / "a.onnx").stat().st_size < 0.6 * whole + 20_000
     with pytest.raises(WeightsError, match="for cnn, not for yolo"):
         load_weights(tmp_path / "a.onnx", "yolo")
     with pytest.raises(WeightsError, match="--mapper forward"):

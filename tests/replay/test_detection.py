@@ -39,7 +39,7 @@ class Knowing:
         crop = np.full((72, 72), 7, np.uint8)
         moved = [replace(one, x=one.x + 0.01) for one in self.session.world.primitives]
         rejection = Rejection(Kind.CIRCLE, 0.1, 0.5, 0.25, "score 0.10 is below 0.30, the least for a circle")
-        return Detections(tuple(Detection(one, 0.9, crop) for one in moved), (rejection,))
+        return Detections(tuple(Detection(one, 0.9, (0.0, 0.0, 0.1, 0.1), crop) for one in moved), (rejection,))
 
 
 @pytest.fixture
