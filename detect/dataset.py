@@ -258,7 +258,7 @@ def write_image(path: Path, image: NDArray[np.uint8]) -> None:
     """Writes a PNG; whole, or not at all."""
     from PIL import Image
 
-    part = path.with_suffix(".part")
+    part = path.with_suffix(f".{os.getpid()}.part")
     Image.fromarray(image).save(part, format="PNG")
     part.replace(path)
 

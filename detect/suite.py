@@ -73,7 +73,7 @@ def single(kind: Kind) -> str:
 
 
 class Suite:
-    """The experiment in a folder; ``say`` is told what is being done."""
+    """The experiment in a folder; ``say`` is told what is being done. One at a time works in a folder."""
 
     def __init__(self, work: Path, say: Say) -> None:
         self.work, self.say = work, say
@@ -95,8 +95,9 @@ class Suite:
     def evaluated(self, case: Case, test: str) -> dict[str, Any]:
         """The evaluation of a case's networks on a set."""
         path = self.work / "results" / f"{case.network}.{test}.json"
-        if not path.exists():
-            detector = Detector.load(self.networks(case), case.row.mapper)
+        networks = self.networks(case)
+        if not path.exists() or path.stat().st_mtime < (networks / DETECTOR).stat().st_mtime:
+            detector = Detector.load(networks, case.row.mapper)
             chosen = samples(self.tests(test), case.row.mapper, "val")
             self.say(f"evaluating {case.network} on {test}")
             path.parent.mkdir(parents=True, exist_ok=True)

@@ -39,7 +39,7 @@ class CnnOptions:
     """How one kind's network is trained. Raises UsageError on what cannot be."""
 
     preset: str = PRIM.name
-    epochs: int = 60
+    epochs: int = 30
     batch: int = 128
     learning_rate: float = 0.001
     channels: int = 1
@@ -208,7 +208,7 @@ class YoloOptions:
     model: str = "yolov5n.yaml"
     start: Path | None = None
     trust: bool = False
-    epochs: int = 100
+    epochs: int = 24
     batch: int = 32
     image_size: int = 224
     optimizer: str = "AdamW"

@@ -144,8 +144,8 @@ def replay(
     from replay.show import ViewerOptions
 
     shown = ViewerOptions(save, spawn, connect, serve, live=rate is not None)
-    if no_viewer and (shown != ViewerOptions(live=shown.live) or map_every):
-        raise UsageError("--no-viewer excludes --save, --spawn, --connect, --serve and --map-every")
+    if no_viewer and (shown != ViewerOptions(live=shown.live) or map_every or detect_every):
+        raise UsageError("--no-viewer excludes --save, --spawn, --connect, --serve, --map-every and --detect-every")
     given = Outputs(save, report, map_output, trajectory)
     jobs = {log: given.named_after(log, mapper.value, not (no_viewer or shown.watched)) for log in logs}
     check_apart(logs, list(jobs.values()))

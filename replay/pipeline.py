@@ -187,9 +187,9 @@ class Pipeline:
             with self._clock.stage("localize"):
                 poses, true_poses = self._localize(log, scans)
             frame = self._frame(scans, poses, truth)
-            lookout = self._lookout(frame, truth)
-            mapper = self._mapper(scans, poses, frame)
             judge = Judge(frame, truth, poses, true_poses)
+            lookout = self._lookout(frame, truth if judge.scores_maps else None)
+            mapper = self._mapper(scans, poses, frame)
             scene = Scene(
                 log.path.name,
                 self.options.mapper,
@@ -198,7 +198,7 @@ class Pipeline:
                 judge.compares_poses,
                 has_evidence=self.options.mapper == "forward",
                 has_detections=lookout is not None,
-                has_errors=lookout is not None and truth is not None,
+                has_errors=lookout is not None and judge.scores_maps,
             )
             self._begin(log, scans, poses, scene)
             used = self._map_scans(scans, poses, mapper, judge, truth, lookout, self._map_every(len(scans), frame))
@@ -288,21 +288,34 @@ class Pipeline:
         return make_mapper(options.mapper, options.resolution, frame.bounds, options.sensor_model, noise_std)
 
     def _lookout(self, frame: GridFrame, truth: Truth | None) -> Lookout | None:
-        """What looks for primitives; None where nothing shall, or no weights are for this mapper."""
+        """What looks for primitives; None, and a note, where it cannot and nobody asked for it by name."""
         options = self.options
-        weights = options.weights or shipped_weights(options.mapper)
-        if not options.detect or weights is None:
-            if options.detect_every:
-                raise UsageError(f"--detect-every: no weights come with prim for {options.mapper}: give --weights")
+        if not options.detect:
             return None
+        asked = options.weights is not None or options.detect_every is not None
+        weights = options.weights or shipped_weights(options.mapper)
+        try:
+            if weights is None:
+                raise UsageError(f"no weights for maps of {options.mapper} come with prim: give --weights")
+            return self._loaded(weights, frame, truth)
+        except UsageError as error:
+            if asked:
+                raise
+            self._notes.append(f"primitives are not looked for: {error}")
+            return None
+
+    def _loaded(self, weights: Path, frame: GridFrame, truth: Truth | None) -> Lookout:
+        """The detector, with a map of its own where it reads other maps than the one that is made."""
         from detect.detector import Detector  # when it is needed: a replay without detection starts faster
 
+        options = self.options
         with self._clock.stage("detect"):
             detector = Detector.load(weights, options.mapper)
         cell = detector.card.resolution
-        own = None
-        if not np.isclose(options.resolution, cell, rtol=1e-6):
-            own = make_mapper(options.mapper, cell, frame.bounds, "eq4", options.noise_std)
+        if np.isclose(options.resolution, cell, rtol=1e-6) and options.sensor_model == "eq4":
+            return Lookout(detector, None, truth)
+        noise_std = options.noise_std if options.mapper == "forward" else None
+        own = make_mapper(options.mapper, cell, GridFrame.covering(frame.bounds, cell).bounds, "eq4", noise_std)
         return Lookout(detector, own, truth)
 
     def _posed(self, scans: ScanLog, poses: LaserPoses) -> Iterator[tuple[int, Scan, Pose2D]]:

@@ -71,3 +71,26 @@ def test_a_network_learns_and_goes_on(run: Run) -> None:
     assert run("cnn", "set", "out", *options, 12)[1] == ""
     code, _, err = run("cnn", "set", "out", *options, 13)
     assert code == 2 and "other options" in err
+
+
+def test_training_begins_where_it_is_told_to(run: Run) -> None:
+    """With steps of next to nothing, what comes out is what went in."""
+    torch = pytest.importorskip("torch", reason="needs the extra [train]")
+    from dataclasses import replace
+
+    from detect.train import YoloOptions, train_yolo
+
+    run("dataset", "set", "--maps", 4, 2, "--mapper", "det", "--kind", "circle", "--noise-std", 0.0)
+    options = YoloOptions(epochs=1, batch=4, mosaic=False, turn=False, seed=3)
+    start = train_yolo(Path("set"), "det", Path("a"), options)
+    frozen = replace(options, start=start, trust=True, learning_rate=1e-9, seed=4)
+    end = train_yolo(Path("set"), "det", Path("b"), frozen)
+
+    def weights(path: Path) -> list[object]:
+        state = torch.load(path, weights_only=False)["model"].float().state_dict()
+        return [value for name, value in state.items() if name.endswith("conv.weight")]
+
+    for before, after in zip(weights(start), weights(end), strict=True):
+        assert torch.allclose(before, after, atol=1e-3)
+    code, _, err = run("yolo", "set", "b", "--mapper", "det", "--epochs", 7)
+    assert code == 2 and "with other options" in err

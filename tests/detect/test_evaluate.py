@@ -118,6 +118,7 @@ def test_a_suite_goes_on_where_it_stopped(tmp_path: Path) -> None:
     for case in suite.cases():
         (tmp_path / "networks" / case.network).mkdir(parents=True, exist_ok=True)
         (tmp_path / "networks" / case.network / "yolo.onnx").touch()
+    for case in suite.cases():
         for kind in ("", *(f"-{kind.value}" for kind in KINDS)):
             (tmp_path / "results").mkdir(exist_ok=True)
             (tmp_path / "results" / f"{case.network}.{case.test}{kind}.json").write_text(json.dumps(made_up(0.5)))

@@ -132,3 +132,33 @@ def test_weights_that_cannot_be_used(
     assert console.run(cli.app, "prim-replay", [str(noisy_session.path), "--weights", "w.onnx"]) == 1
     error = capsys.readouterr().err
     assert said in error and error.count("\n") == 1 and not list(Path().glob("*.rrd*"))
+
+
+def test_without_weights_a_note_says_so(noisy_session: Session, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("replay.lookout.SHIPPED", Path("nowhere"))
+    result = Pipeline(noisy_session.path, ReplayOptions()).run()
+    assert any("not looked for: no weights for maps of det" in note for note in result.notes)
+    with pytest.raises(UsageError, match="give --weights"):
+        Pipeline(noisy_session.path, ReplayOptions(detect_every=3)).run()
+
+
+def test_a_map_that_is_too_large_for_the_detector(
+    noisy_session: Session, knowing: Knowing, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The map itself fits: the replay goes on, and says that it does not look for primitives."""
+    monkeypatch.setattr("mapping.grid.MAX_CELLS", 10_000)
+    monkeypatch.setattr("replay.pipeline.shipped_weights", lambda mapper: Path("w"))
+    result = Pipeline(noisy_session.path, ReplayOptions(resolution=0.05)).run()
+    assert any(note.startswith("primitives are not looked for: a map of") for note in result.notes)
+
+
+def test_nothing_is_held_against_the_truth_where_poses_are_in_no_known_frame(
+    noisy_session: Session, knowing: Knowing
+) -> None:
+    told = report(replayed(noisy_session, standing_still=True))
+    assert told["primitives"] and told["errors"] is None and told["map"]["scores"] is None
+
+
+def test_the_gaussian_sensor_model_leaves_the_detector_its_own_map(noisy_session: Session, knowing: Knowing) -> None:
+    replayed(noisy_session, mapper="prob", sensor_model="gaussian", noise_std=0.05, resolution=0.05)
+    assert knowing.seen[0].frame.resolution == 0.01
