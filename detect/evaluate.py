@@ -81,7 +81,7 @@ class Evaluation:
 
 
 @dataclass(frozen=True)
-class _Pictured:
+class Pictured:
     """A sample with its image."""
 
     sample: Sample
@@ -109,7 +109,7 @@ def evaluate(detector: Detector, samples: Sequence[Sample], progress: Progress |
     detections = right = covered = 0
     times = np.zeros(3)
     for done, sample in enumerate(samples, start=1):
-        pictured = _Pictured(sample, read_image(sample))
+        pictured = Pictured(sample, read_image(sample))
         _, yolo_time = _timed(partial(detector.yolo, pictured.image[None], FLOOR))
         read, parameters_time = _timed(partial(detector.estimator, pictured.true_boxes))
         tile = [(sample.frame, pictured.image)]
@@ -144,7 +144,7 @@ def choose_thresholds(yolo: Yolo, samples: Sequence[Sample]) -> dict[str, float]
     """For each kind the least score that makes its F1 largest on a set's samples, among a detector's candidates."""
     marked: list[Marked] = []
     for begin in range(0, len(samples), BATCH):
-        batch = [_Pictured(sample, read_image(sample)) for sample in samples[begin : begin + BATCH]]
+        batch = [Pictured(sample, read_image(sample)) for sample in samples[begin : begin + BATCH]]
         seen = yolo(np.stack([one.image for one in batch]), CANDIDATE)
         for one, boxes in zip(batch, seen, strict=True):
             stay = suppress(boxes, OVERLAP_LIMIT) == np.arange(len(boxes))
@@ -152,7 +152,7 @@ def choose_thresholds(yolo: Yolo, samples: Sequence[Sample]) -> dict[str, float]
     return best_confidences(marked)
 
 
-def mark(yolo: Yolo, batch: Sequence[_Pictured]) -> list[Marked]:
+def mark(yolo: Yolo, batch: Sequence[Pictured]) -> list[Marked]:
     """Candidates beside true boxes, by the rules of YOLOv5's own evaluation."""
     images = np.stack([one.image for one in batch])
     return [

@@ -54,6 +54,19 @@ def test_without_torch_the_extra_is_named(run: Run, monkeypatch: pytest.MonkeyPa
     assert code == 2 and "pip install -e '.[train]'" in err and err.count("\n") == 1
 
 
+@pytest.mark.parametrize(("app", "arguments"), [("train", ["all", "w"]), ("evaluation", ["w"])])
+def test_whole_suites_name_the_extra(
+    in_tmp: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    app: str,
+    arguments: list[str],
+) -> None:
+    monkeypatch.setattr(cli, "find_spec", lambda name: None)
+    assert console.run(getattr(cli, app), "prim", arguments) == 2
+    assert "pip install -e '.[train]'" in capsys.readouterr().err and not list(in_tmp.iterdir())
+
+
 def test_weights_that_can_run_code_must_be_trusted(run: Run) -> None:
     pytest.importorskip("torch", reason="needs the extra [train]")
     code, _, err = run("yolo", "set", "out", "--start", "a.pt")

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import json
 import pickle
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from detect.weights import Card, WeightsError, load_weights
+from detect.weights import Card, WeightsError, load_set, load_weights
 
 
 @pytest.mark.parametrize(
@@ -52,13 +54,22 @@ def test_an_exported_network_gives_torch_s_numbers(tmp_path: Path, preset: str, 
     from detect.networks import ParameterNetwork
     from detect.parameters import PRESETS
     from detect.train import CnnOptions
+    from prim.errors import UsageError
     from prim.shapes import Kind
 
     torch.manual_seed(1)
     network = ParameterNetwork([Kind(kind)], PRESETS[preset])
     network.eval()
-    state = {"options": asdict(CnnOptions(preset)), "kinds": [kind], "network": network.state_dict()}
+    state = {
+        "options": asdict(CnnOptions(preset)),
+        "kinds": [kind],
+        "mapper": "forward",
+        "style": "grey",
+        "network": network.state_dict(),
+    }
     torch.save(state, tmp_path / "a.pt")
+    with pytest.raises(UsageError, match="maps of forward, not of det"):
+        export_cnn(tmp_path / "a.pt", "det", tmp_path / "a.onnx")
     export_cnn(tmp_path / "a.pt", "forward", tmp_path / "a.onnx")
     weights = load_weights(tmp_path / "a.onnx", "cnn", "forward")
     assert (weights.card.kinds, weights.card.preset) == ((kind,), preset)
@@ -74,6 +85,70 @@ def test_an_exported_network_gives_torch_s_numbers(tmp_path: Path, preset: str, 
         load_weights(tmp_path / "a.onnx", "yolo")
     with pytest.raises(WeightsError, match="--mapper forward"):
         load_weights(tmp_path / "a.onnx", "cnn", "det")
+
+
+def tiny(path: Path, card: Card | str) -> None:
+    """A network that gives back what it gets, with a card, or with any text in its place."""
+    onnx = pytest.importorskip("onnx", reason="needs the extra [train]")
+    from onnx import TensorProto, helper
+
+    ends = [helper.make_tensor_value_info(name, TensorProto.FLOAT, ["n"]) for name in ("a", "b")]
+    graph = helper.make_graph([helper.make_node("Identity", ["a"], ["b"])], "tiny", ends[:1], ends[1:])
+    model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=8)
+    model.metadata_props.add(key="prim", value=card if isinstance(card, str) else card.to_json())
+    onnx.save(model, str(path))
+
+
+YOLO, CNN = Card("yolo", "det"), Card("cnn", "det", preset="prim", channels=1)
+
+
+def test_a_folder_of_weights(tmp_path: Path) -> None:
+    tiny(tmp_path / "yolo.onnx", YOLO)
+    tiny(tmp_path / "cnn.onnx", CNN)
+    for path in (tmp_path, tmp_path / "yolo.onnx"):
+        yolo, networks = load_set(path, "det")
+        assert yolo.card == YOLO and [network.card for network in networks] == [CNN]
+
+
+@pytest.mark.parametrize(
+    ("others", "said"),
+    [
+        ([], "no network that reads the parameters of: circle, ellipse, rectangle, square, triangle"),
+        ([replace(CNN, kinds=("square", "circle"))], "no network that reads the parameters of: ellipse, rectangle"),
+        ([CNN, replace(CNN, kinds=("square",))], "several networks for: square"),
+        ([replace(CNN, mapper="prob")], "reads the maps of prob, not of det"),
+        ([replace(CNN, style="rounded")], "reads other images"),
+        ([replace(CNN, resolution=0.05)], "reads other images"),
+        ([YOLO], "a network for yolo, not for cnn"),
+    ],
+)
+def test_folders_that_do_not_fit(tmp_path: Path, others: list[Card], said: str) -> None:
+    tiny(tmp_path / "yolo.onnx", YOLO)
+    for number, card in enumerate(others):
+        tiny(tmp_path / f"cnn.{number}.onnx", card)
+    with pytest.raises(WeightsError, match=said):
+        load_set(tmp_path, "det")
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"stage": "magic"},
+        {"kinds": [["square"]]},
+        {"kinds": ["hexagon"]},
+        {"style": "loud"},
+        {"channels": "a"},
+        {"resolution": "x"},
+        {"resolution": 0.0},
+        {"thresholds": [1]},
+        {"thresholds": {"square": 7.0}},
+        {"mapper": 3},
+    ],
+)
+def test_cards_that_say_what_none_of_ours_says(tmp_path: Path, change: dict[str, object]) -> None:
+    tiny(tmp_path / "a.onnx", json.dumps(json.loads(YOLO.to_json()) | change))
+    with pytest.raises(WeightsError, match="has no model card"):
+        load_weights(tmp_path / "a.onnx", "yolo")
 
 
 def test_what_is_no_checkpoint_is_not_exported(tmp_path: Path) -> None:

@@ -1,0 +1,177 @@
+"""YOLO in less than single precision, or by another runtime: how fast, and what it costs in accuracy.
+
+    python -m bench.precision WEIGHTS SET [--update docs/detect.md]
+
+WEIGHTS is a folder of weights, SET a set of ``prim-train dataset``: int8 is calibrated on its training split,
+accuracy is of its validation split. Times are of one tile, on all cores, in turns. OpenVINO is tried where it is
+installed. Needs the extra [train].
+"""
+
+from __future__ import annotations
+
+import argparse
+import tempfile
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bench.detect import timed
+from bench.maps import update
+from detect.dataset import Sample, samples
+from detect.evaluate import BATCH, Pictured, mark, read_image
+from detect.scores import score_boxes
+from detect.weights import DETECTOR, Weights, load_weights
+from detect.yolo import Yolo
+
+CALIBRATION = 100
+"""Images that int8's ranges are found from."""
+
+Run = Callable[[NDArray[np.float32]], NDArray[np.float32]]
+
+
+def images_of(chosen: Sequence[Sample]) -> NDArray[np.float32]:
+    """Images (N, 3, TILE, TILE) as the network takes them."""
+    stacked = np.stack([read_image(sample) for sample in chosen]).transpose(0, 3, 1, 2)
+    return np.ascontiguousarray(stacked, np.float32) / np.float32(255)
+
+
+def half(weights: Path, folder: Path) -> Path:
+    """Arithmetic in half precision."""
+    import onnx
+    from onnxruntime.transformers.float16 import convert_float_to_float16
+
+    path = folder / "half.onnx"
+    onnx.save(convert_float_to_float16(widened(weights), keep_io_types=True), str(path))
+    return path
+
+
+def widened(weights: Path) -> Any:
+    """The network with its weights in single precision, as before export halves them."""
+    import onnx
+    from onnx import TensorProto, numpy_helper
+
+    model = onnx.load(str(weights))
+    kept = {tensor.name: tensor for tensor in model.graph.initializer}
+    for node in [node for node in model.graph.node if node.op_type == "Cast" and node.input[0].endswith(".half")]:
+        tensor = kept[node.input[0]]
+        model.graph.initializer.append(
+            numpy_helper.from_array(numpy_helper.to_array(tensor).astype(np.float32), node.output[0])
+        )
+        model.graph.initializer.remove(tensor)
+        model.graph.node.remove(node)
+    assert all(tensor.data_type != TensorProto.FLOAT16 for tensor in model.graph.initializer)
+    return model
+
+
+def int8(weights: Path, folder: Path, chosen: Sequence[Sample]) -> Path:
+    """Convolutions in eight bits, with ranges from some images; what comes behind them stays as it is."""
+    import onnx
+    from onnxruntime.quantization import CalibrationDataReader, QuantFormat, QuantType, quantize_static
+
+    class Reader(CalibrationDataReader):  # type: ignore[misc]
+        def __init__(self) -> None:
+            self._images = iter(images_of(chosen))
+
+        def get_next(self) -> dict[str, NDArray[np.float32]] | None:
+            image = next(self._images, None)
+            return None if image is None else {"images": image[None]}
+
+    whole, path = folder / "whole.onnx", folder / "int8.onnx"
+    onnx.save(widened(weights), str(whole))
+    quantize_static(
+        str(whole),
+        str(path),
+        Reader(),
+        quant_format=QuantFormat.QDQ,
+        activation_type=QuantType.QUInt8,
+        weight_type=QuantType.QInt8,
+        per_channel=True,
+        op_types_to_quantize=["Conv"],
+    )
+    return path
+
+
+def onnx_run(path: Path) -> Run:
+    import onnxruntime
+
+    session = onnxruntime.InferenceSession(path, providers=["CPUExecutionProvider"])
+    return lambda images: np.asarray(session.run(None, {"images": images})[0])
+
+
+def openvino_run(weights: Path, folder: Path, precision: str) -> Run:
+    import onnx
+    import openvino
+
+    path = folder / "openvino.onnx"
+    onnx.save(widened(weights), str(path))
+    core = openvino.Core()
+    hints = {"PERFORMANCE_HINT": "LATENCY", "INFERENCE_PRECISION_HINT": precision}
+    compiled = core.compile_model(str(path), "CPU", hints)
+    return lambda images: np.asarray(compiled(images)[0])
+
+
+class _Session:
+    """A runtime in ONNX Runtime's clothes."""
+
+    def __init__(self, run: Run, like: Weights) -> None:
+        self._run, self._like = run, like
+
+    def get_inputs(self) -> Any:
+        return self._like.session.get_inputs()
+
+    def run(self, wanted: object, feeds: dict[str, NDArray[np.float32]]) -> list[NDArray[np.float32]]:
+        return [self._run(next(iter(feeds.values())))]
+
+
+def accuracy(run: Run, like: Weights, chosen: Sequence[Sample]) -> tuple[float, float, float]:
+    """F1, mAP 0.5 and mAP 0.5-0.95."""
+    yolo = Yolo(replace(like, session=_Session(run, like)))
+    marked = []
+    for begin in range(0, len(chosen), BATCH):
+        marked += mark(yolo, [Pictured(one, read_image(one)) for one in chosen[begin : begin + BATCH]])
+    row = score_boxes(marked)["all"]
+    return row.f1, row.map50, row.map50_95
+
+
+def runs(weights: Path, folder: Path, training: Sequence[Sample]) -> dict[str, Run]:
+    """Every way of running the network that this machine has."""
+    found = {
+        "**ONNX Runtime, single precision** (shipped; weights kept in half)": onnx_run(weights),
+        "ONNX Runtime, half precision": onnx_run(half(weights, folder)),
+        "ONNX Runtime, int8": onnx_run(int8(weights, folder, training[:CALIBRATION])),
+    }
+    try:
+        found["OpenVINO, single precision"] = openvino_run(weights, folder, "f32")
+        found["OpenVINO, bfloat16"] = openvino_run(weights, folder, "bf16")
+    except ImportError:
+        print("OpenVINO is not installed: left out")
+    return found
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser.add_argument("weights", type=Path)
+    parser.add_argument("set", type=Path)
+    parser.add_argument("--update", type=Path)
+    options = parser.parse_args()
+    like = load_weights(options.weights / DETECTOR, "yolo")
+    training, chosen = (samples(options.set, like.card.mapper, split) for split in ("train", "val"))
+    lines = ["| YOLO, one tile | best, ms | median, ms | F1 | mAP 0.5 | mAP 0.5–0.95 |", "|---|" + "---:|" * 5]
+    with tempfile.TemporaryDirectory() as folder:
+        ways = runs(options.weights / DETECTOR, Path(folder), training)
+        tile = images_of(chosen[:1])
+        times = timed({name: lambda run=run: run(tile) for name, run in ways.items()})  # type: ignore[misc]
+        for name, run in ways.items():
+            scores = " | ".join(f"{value:.3f}" for value in accuracy(run, like, chosen))
+            lines.append(f"| {name} | {times[name][0]:.1f} | {times[name][1]:.1f} | {scores} |")
+    print("\n".join(lines))
+    if options.update:
+        update(options.update, "precision", "\n".join(lines))
+
+
+if __name__ == "__main__":
+    main()
