@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -15,16 +16,27 @@ from replay.truth import Truth
 
 if TYPE_CHECKING:
     from detect.detector import Detections, Detector
+    from detect.tracks import Tracker
 
 SHIPPED = Path(__file__).parents[1] / "detect" / "shipped"
 """The weights that come with prim: a folder for each mapper."""
 
 
 @dataclass(frozen=True)
+class Identity:
+    """Which track a detection belongs to; ``std`` (m, rad) is the track's, by name, where looks were many."""
+
+    id: int
+    confirmed: bool = True
+    std: Mapping[str, float] | None = None
+
+
+@dataclass(frozen=True)
 class Sighting:
-    """What was found in a map; where there is a truth, the true primitives and how it compares with them."""
+    """What was found in a map, each with its identity; where there is a truth, how it compares with that."""
 
     detections: Detections
+    identities: tuple[Identity, ...]
     truth: tuple[Primitive, ...] = ()
     errors: DetectionErrors | None = None
 
@@ -33,10 +45,14 @@ class Lookout:
     """Looks for primitives with a detector: in the replay's map, or in one of its own where cells differ.
 
     ``own`` is a mapper with cells of the size that the detector reads; None where the replay's own map has them.
+    With ``tracker``, for a detector that looks more than once, what is found keeps its id.
     """
 
-    def __init__(self, detector: Detector, own: Mapper | None, truth: Truth | None) -> None:
+    def __init__(
+        self, detector: Detector, own: Mapper | None, truth: Truth | None, tracker: Tracker | None = None
+    ) -> None:
         self._detector = detector
+        self._tracker = tracker
         self._own = own
         self._truth = truth
 
@@ -60,10 +76,19 @@ class Lookout:
 
     def _sighting(self, grid: OccupancyGrid, stamp: int) -> Sighting:
         detections = self._detector.detect(grid)
+        identities = self._identities(detections)
         if self._truth is None:
-            return Sighting(detections)
+            return Sighting(detections, identities)
         true = tuple(self._truth.at(stamp).primitives)
-        return Sighting(detections, true, detection_errors([one.primitive for one in detections.found], true))
+        errors = detection_errors([one.primitive for one in detections.found], true)
+        return Sighting(detections, identities, true, errors)
+
+    def _identities(self, detections: Detections) -> tuple[Identity, ...]:
+        """The detections' tracks; one after the other where there is one look only."""
+        if self._tracker is None:
+            return tuple(Identity(number) for number in range(1, len(detections.found) + 1))
+        tracks = self._tracker.update(detections.found)
+        return tuple(Identity(track.id, track.confirmed, track.std) for track in tracks)
 
 
 def shipped_weights(mapper: str) -> Path | None:

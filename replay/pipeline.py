@@ -311,12 +311,17 @@ class Pipeline:
         options = self.options
         with self._clock.stage("detect"):
             detector = Detector.load(weights, options.mapper)
+        tracker = None
+        if options.detect_every is not None:
+            from detect.tracks import Tracker
+
+            tracker = Tracker()
         cell = detector.card.resolution
         if np.isclose(options.resolution, cell, rtol=1e-6) and options.sensor_model == "eq4":
-            return Lookout(detector, None, truth)
+            return Lookout(detector, None, truth, tracker)
         noise_std = options.noise_std if options.mapper == "forward" else None
         own = make_mapper(options.mapper, cell, GridFrame.covering(frame.bounds, cell).bounds, "eq4", noise_std)
-        return Lookout(detector, own, truth)
+        return Lookout(detector, own, truth, tracker)
 
     def _posed(self, scans: ScanLog, poses: LaserPoses) -> Iterator[tuple[int, Scan, Pose2D]]:
         """The scans that have a pose: position, scan as seen from above, pose of the laser."""

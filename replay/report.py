@@ -67,10 +67,11 @@ def report(result: ReplayResult) -> dict[str, Any]:
 
 def _primitives(sighting: Sighting | None) -> list[dict[str, Any]]:
     """What was found, best first."""
-    found = () if sighting is None else sighting.detections.found
+    if sighting is None:
+        return []
     return [
-        {"id": number} | one.primitive.to_json() | {"score": one.score, "stage": "detected", "std": None}
-        for number, one in enumerate(found, start=1)
+        {"id": identity.id} | one.primitive.to_json() | {"score": one.score, "stage": "detected", "std": None}
+        for identity, one in zip(sighting.identities, sighting.detections.found, strict=True)
     ]
 
 
@@ -90,7 +91,7 @@ def _errors(sighting: Sighting | None) -> dict[str, Any] | None:
         "iou": errors.iou,
         "pairs": [
             {
-                "id": pair.detection + 1,
+                "id": sighting.identities[pair.detection].id,
                 "truth": pair.truth,
                 "kind": str(found[pair.detection].primitive.kind),
                 "truth_kind": str(sighting.truth[pair.truth].kind),

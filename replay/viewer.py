@@ -24,7 +24,7 @@ from prim.metrics import DetectionErrors, MapScores
 from prim.raycast import FloatArray
 from prim.shapes import Kind
 from prim.world import World
-from replay.lookout import Sighting
+from replay.lookout import Identity, Sighting
 from replay.pipeline import ReplayResult
 from replay.report import table
 from replay.show import Scene, ViewerOptions
@@ -184,8 +184,8 @@ class RerunViewer:
         self._send_batch()
         self._at(position, stamp)
         found = sighting.detections.found
-        self._recording.log("map/detections", self._outlines(found))
-        self._recording.log("detections", rr.TextDocument(_detections_table(found), media_type="text/markdown"))
+        self._recording.log("map/detections", self._outlines(sighting))
+        self._recording.log("detections", rr.TextDocument(_detections_table(sighting), media_type="text/markdown"))
         self._recording.log("crops", rr.Image(_crops(found)))
         errors = sighting.errors
         if errors is not None:
@@ -194,12 +194,14 @@ class RerunViewer:
             angle = math.nan if errors.angle is None else math.degrees(errors.angle)
             self._recording.log("errors/angle", rr.Scalars([angle]))
 
-    def _outlines(self, found: Sequence[Detection]) -> Any:
-        """Found primitives as labelled outlines in their kind's colour."""
+    def _outlines(self, sighting: Sighting) -> Any:
+        """Found primitives as outlines in their kind's colour with id, kind, score; «?» while a track is tentative."""
+        found = sighting.detections.found
+        names = [f"{one.id}{'' if one.confirmed else '?'}" for one in sighting.identities]
         rings = [np.vstack((ring := one.primitive.outline(64), ring[:1])) for one in found]
         return rr.LineStrips3D(
             [self._lifted(ring, FOUND_LIFT) for ring in rings],
-            labels=[f"{number}: {one.primitive.kind} {one.score:.2f}" for number, one in enumerate(found, start=1)],
+            labels=[f"{name}: {one.primitive.kind} {one.score:.2f}" for name, one in zip(names, found, strict=True)],
             colors=[KIND_COLORS[one.primitive.kind] for one in found],
             radii=rr.Radius.ui_points(2.0),
             show_labels=True,
@@ -389,18 +391,27 @@ def _values(errors: DetectionErrors, series: Iterable[str], unit: float) -> list
     return [math.nan if (value := getattr(errors, name)) is None else unit * value for name in series]
 
 
-def _detections_table(found: Sequence[Detection]) -> str:
+def _detections_table(sighting: Sighting) -> str:
     """Found primitives as a Markdown table: lengths in millimetres, angles in degrees."""
-    lines = ["| | kind | score | x, mm | y, mm | angle | size, mm |", "|---|---|---:|---:|---:|---:|---|"]
-    for number, one in enumerate(found, start=1):
+    lines = ["| id | kind | score | x, mm | y, mm | angle | size, mm | ± of the track |", "|" + "---|" * 8]
+    for identity, one in zip(sighting.identities, sighting.detections.found, strict=True):
         primitive = one.primitive
         angle = "" if primitive.theta is None else f"{math.degrees(primitive.theta):.1f}°"
-        size = ", ".join(f"{name} {1000 * value:.0f}" for name, value in primitive.sizes.items())
+        size = ", ".join(f"{key.replace('_', ' ')} {1000 * value:.0f}" for key, value in primitive.sizes.items())
         place = f"{1000 * primitive.x:.0f} | {1000 * primitive.y:.0f}"
-        lines.append(
-            f"| {number} | {primitive.kind} | {one.score:.2f} | {place} | {angle} | {size.replace('_', ' ')} |"
-        )
+        cells = (identity.id, primitive.kind, f"{one.score:.2f}", place, angle, size, _spread(identity))
+        lines.append(f"| {' | '.join(str(cell) for cell in cells)} |")
     return "\n".join(lines) + "\n"
+
+
+def _spread(identity: Identity) -> str:
+    """A track's standard deviations in words."""
+    if identity.std is None:
+        return ""
+    return ", ".join(
+        f"angle {math.degrees(std):.1f}°" if name == "theta" else f"{name.replace('_', ' ')} {1000 * std:.0f}"
+        for name, std in identity.std.items()
+    )
 
 
 def _crops(found: Sequence[Detection]) -> NDArray[np.uint8]:
