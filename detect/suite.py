@@ -1,4 +1,4 @@
-"""The paper's experiment made again: sets, networks, tables; ``prim-eval --suite paper``.
+"""The suites of ``prim-eval``: the paper's experiment made again, and the shipped weights on fresh sessions.
 
 Everything lies in one folder and is made once: an interrupted run goes on where it stopped.
 
@@ -14,8 +14,9 @@ Noise has two readings (DESIGN: n is a share of 5 m as written, of 1 m as the pa
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -26,7 +27,8 @@ from detect.paper import ROWS, Row
 from detect.parameters import PAPER
 from detect.recipe import Say, make_set, make_start, make_weights
 from detect.weights import DETECTOR
-from prim.errors import OutputError
+from mapping.mapper import MAPPERS
+from prim.errors import OutputError, UsageError
 from prim.shapes import Kind
 
 READINGS = {"as the maps suggest": 1.0, "as written": 5.0}
@@ -37,6 +39,10 @@ TESTING = SetOptions(sizes=(0, 125), seed=150_000, rounded=PRESETS["paper"].roun
 SINGLE = SetOptions(sizes=(0, 50), seed=160_000, rounded=PRESETS["paper"].rounded)
 SINGLE_STEP = 1000
 """Sets of one kind have seeds this far apart."""
+
+
+SHIPPED_NOISE = (0, 50, 75, 100, 250, 375, 500)
+OTHERS_NOISE = (50, 250, 500)
 
 
 @dataclass(frozen=True)
@@ -95,15 +101,7 @@ class Suite:
     def evaluated(self, case: Case, test: str) -> dict[str, Any]:
         """The evaluation of a case's networks on a set."""
         path = self.work / "results" / f"{case.network}.{test}.json"
-        networks = self.networks(case)
-        if not path.exists() or path.stat().st_mtime < (networks / DETECTOR).stat().st_mtime:
-            detector = Detector.load(networks, case.row.mapper)
-            chosen = samples(self.tests(test), case.row.mapper, "val")
-            self.say(f"evaluating {case.network} on {test}")
-            path.parent.mkdir(parents=True, exist_ok=True)
-            write(path, json.dumps(evaluate(detector, chosen).to_json(), indent=1))
-        value: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
-        return value
+        return evaluated(path, self.networks(case), case.row.mapper, lambda: self.tests(test), self.say)
 
     def networks(self, case: Case) -> Path:
         """The folder of a case's networks, trained."""
@@ -129,6 +127,72 @@ class Suite:
 
     def _made(self, name: str, options: SetOptions) -> Path:
         return make_set(self.work / name, options, self.say)
+
+
+@dataclass(frozen=True)
+class Condition:
+    """How the sessions of one row of the shipped weights' table are recorded."""
+
+    name: str
+    noise_mm: int
+    options: SetOptions
+
+    @property
+    def set(self) -> str:
+        """Its folder."""
+        return f"{self.name.replace(' ', '-')}-{self.noise_mm}"
+
+
+def conditions(sessions: int) -> Iterator[Condition]:
+    """All noise levels on warped sessions, and other ways of recording at three of them."""
+    plain = SetOptions(sizes=(0, sessions), seed=300_000)
+    for noise_mm in SHIPPED_NOISE:
+        yield Condition("warped", noise_mm, replace(plain, noise_stds=(noise_mm / 1000,)))
+    others: dict[str, dict[str, Any]] = {
+        "driven": {"motions": ("drive",)},
+        "no walls": {"walled": 0.0},
+        "180 rays": {"rays": (180,)},
+        "1000 rays": {"rays": (1000,)},
+    }
+    for name, change in others.items():
+        for noise_mm in OTHERS_NOISE:
+            yield Condition(name, noise_mm, replace(plain, noise_stds=(noise_mm / 1000,), **change))
+
+
+class ShippedSuite:
+    """The weights of a folder, one inside it for each mapper, on fresh sessions; ``say`` is told what is being done."""
+
+    def __init__(self, work: Path, weights: Path, sessions: int, say: Say) -> None:
+        self.work, self.weights, self.sessions, self.say = work, weights, sessions, say
+
+    def run(self) -> list[tuple[Condition, str, dict[str, Any]]]:
+        """Makes what is missing; returns each condition with a mapper and the evaluation of its weights.
+
+        Raises UsageError where the folder holds no weights.
+        """
+        mappers = [mapper for mapper in MAPPERS if (self.weights / mapper / DETECTOR).exists()]
+        if not mappers:
+            raise UsageError(f"{self.weights} holds no weights: a folder for each mapper is wanted")
+        found = []
+        for condition in conditions(self.sessions):
+            for mapper in mappers:
+                path = self.work / "results" / f"{condition.set}.{self.sessions}.{mapper}.json"
+                folder = self.work / f"{condition.set}.{self.sessions}"
+                data = partial(make_set, folder, condition.options, self.say)
+                found.append((condition, mapper, evaluated(path, self.weights / mapper, mapper, data, self.say)))
+        return found
+
+
+def evaluated(path: Path, networks: Path, mapper: str, data: Callable[[], Path], say: Say) -> dict[str, Any]:
+    """The evaluation of networks on a set, kept at ``path``; made again where the networks are newer."""
+    if not path.exists() or path.stat().st_mtime < (networks / DETECTOR).stat().st_mtime:
+        detector = Detector.load(networks, mapper)
+        chosen = samples(data(), mapper, "val")
+        say(f"evaluating {path.stem}")
+        path.parent.mkdir(parents=True, exist_ok=True)
+        write(path, json.dumps(evaluate(detector, chosen).to_json(), indent=1))
+    value: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
+    return value
 
 
 def write(path: Path, text: str) -> None:

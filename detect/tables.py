@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from detect.paper import ROWS, SHAPES, TABLE_1, TABLE_2, TESTED, Row
-from detect.suite import Case, write
+from detect.suite import Case, Condition, write
 
 Result = tuple[Case, dict[str, Any], dict[str, dict[str, Any]]]
 """A case, its evaluation, and its evaluations on maps with one kind alone."""
@@ -232,3 +232,44 @@ def _plot(results: Sequence[Result], path: Path) -> None:
             axis.grid(alpha=0.3)
             axis.legend(fontsize=7)
     figure.savefig(path, dpi=110)
+
+
+SHIPPED = """\
+# The shipped weights, measured
+
+Made by `prim-eval --suite shipped`; seeds and ways of recording stand in `detect/suite.py`: no network was trained or
+chosen on these sessions. F1, mAP 0.5 and mAP 0.5–0.95 are of boxes, as in [the paper's tables](paper.md); «found» is
+the F1 of the whole pipeline (kind right, outlines overlap by half), with the mean errors of what it finds (of angles
+the median)."""
+
+SHIPPED_COLUMNS = ("f1", "map50", "map50_95", "found", "position_mm", "width_mm", "height_mm", "median_angle_deg")
+
+
+def report_shipped(
+    results: Sequence[tuple[Condition, str, dict[str, Any]]], sessions: int, folder: Path
+) -> list[Path]:
+    """Writes shipped.md and shipped.csv; returns their paths. Raises OutputError where it cannot."""
+    folder.mkdir(parents=True, exist_ok=True)
+    markdown, table = folder / "shipped.md", folder / "shipped.csv"
+    names = ("F1", "mAP 0.5", "mAP 0.5–0.95", "found", "place (mm)", "width (mm)", "height (mm)", "angle (°)")
+    lines = [f"{SHIPPED} {sessions} sessions a row.", ""]
+    lines += [f"| recorded | noise (mm) | mapper | {' | '.join(names)} |", "|---|---:|---|" + "---:|" * len(names)]
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(("recorded", "noise_std_m", "mapper", *SHIPPED_COLUMNS))
+    for condition, mapper, found in results:
+        values = _shipped_values(found)
+        cells = [_shown(value, None, 3 if k < 4 else 1) for k, value in enumerate(values)]
+        lines.append(f"| {condition.name} | {condition.noise_mm} | {mapper} | {' | '.join(cells)} |")
+        told = ("" if value is None else f"{value:.5g}" for value in values)
+        writer.writerow((condition.name, condition.noise_mm / 1000, mapper, *told))
+    write(markdown, "\n".join(lines) + "\n")
+    write(table, text.getvalue())
+    return [markdown, table]
+
+
+def _shipped_values(found: dict[str, Any]) -> list[float | None]:
+    """One row, in the order of SHIPPED_COLUMNS."""
+    boxes, errors = found["boxes"].get("all", {}), found["detected"].get("all")
+    told = [_in_units(errors, name) for name in ("position", "width", "height", "median_angle")]
+    return [*(boxes.get(name) for name in ("f1", "map50", "map50_95")), found["found"][2], *told]

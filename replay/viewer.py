@@ -195,7 +195,7 @@ class RerunViewer:
             self._recording.log("errors/angle", rr.Scalars([angle]))
 
     def _outlines(self, sighting: Sighting) -> Any:
-        """Found primitives as outlines in their kind's colour with id, kind, score; «?» while a track is tentative."""
+        """Found primitives as outlines in their kind's colour: id, kind, score; «?» while a track is tentative."""
         found = sighting.detections.found
         names = [f"{one.id}{'' if one.confirmed else '?'}" for one in sighting.identities]
         rings = [np.vstack((ring := one.primitive.outline(64), ring[:1])) for one in found]

@@ -131,3 +131,16 @@ def test_a_set_with_other_options_is_not_taken(tmp_path: Path) -> None:
     (folder / "manifest.json").write_text("{}")
     with pytest.raises(UsageError, match="other options"):
         suite.Suite(tmp_path, lambda text: None).tests("test-50")
+
+
+def test_the_shipped_weights_report(tmp_path: Path) -> None:
+    results = [(condition, "forward", made_up(0.9)) for condition in suite.conditions(500)]
+    markdown, table = tables.report_shipped(results, 500, tmp_path)
+    assert "| warped | 250 | forward | 0.900 | 0.900 | 0.900 | 0.000 | – |" in markdown.read_text()
+    lines = list(csv.DictReader(table.open()))
+    assert len(lines) == 7 + 4 * 3 and {line["recorded"] for line in lines} >= {"driven", "no walls", "180 rays"}
+
+
+def test_shipped_weights_that_are_not_there(tmp_path: Path) -> None:
+    with pytest.raises(UsageError, match="holds no weights"):
+        suite.ShippedSuite(tmp_path, tmp_path, 5, lambda text: None).run()
