@@ -160,7 +160,7 @@ def conditions(sessions: int) -> Iterator[Condition]:
 
 
 class ShippedSuite:
-    """The weights of a folder, one inside it for each mapper, on fresh sessions; ``say`` is told what is being done."""
+    """The weights of a folder, one inside it for each mapper, on fresh sessions; ``say`` is told what is done."""
 
     def __init__(self, work: Path, weights: Path, sessions: int, say: Say) -> None:
         self.work, self.weights, self.sessions, self.say = work, weights, sessions, say
