@@ -5,9 +5,12 @@ from __future__ import annotations
 from collections.abc import Callable
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from detect import cli
+from detect.tiles import TILE
+from detect.weights import load_weights
 from prim import console
 
 Run = Callable[..., tuple[int, str, str]]
@@ -107,3 +110,18 @@ def test_training_begins_where_it_is_told_to(run: Run) -> None:
         assert torch.allclose(before, after, atol=1e-3)
     code, _, err = run("yolo", "set", "b", "--mapper", "det", "--epochs", 7)
     assert code == 2 and "with other options" in err
+
+    # what is exported gives ultralytics' own boxes and scores, and has thresholds and a card
+    asked = ("export", start, "yolo.onnx", "--stage", "yolo", "--mapper", "det")
+    assert "--set" in run(*asked)[2] and "--trust" in run(*asked, "--set", "set")[2]
+    assert run(*asked, "--set", "set", "--trust")[0] == 0
+    exported = load_weights(Path("yolo.onnx"), "yolo", "det")
+    assert set(exported.card.thresholds) == {"circle"} and exported.card.style == "rounded"
+    images = np.random.default_rng(0).random((2, 3, TILE, TILE), dtype=np.float32)
+    model = torch.load(start, weights_only=False)["model"].float().eval()
+    with torch.no_grad():
+        wanted = model(torch.from_numpy(images))[0].numpy()
+    outputs = exported.session.run(None, {"images": images})[0]
+    assert outputs.shape == wanted.shape == (2, 9, 1029)
+    assert outputs[:, :4] == pytest.approx(wanted[:, :4], abs=0.5)  # cells; weights are kept in half precision
+    assert outputs[:, 4:] == pytest.approx(wanted[:, 4:], abs=5e-3)

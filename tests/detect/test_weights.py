@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from detect.weights import Card, WeightsError, load_set, load_weights
+from detect.weights import ALL_KINDS, Card, WeightsError, load_set, load_weights
 
 
 @pytest.mark.parametrize(
@@ -44,8 +44,8 @@ def test_a_card_reads_back() -> None:
 
 
 @pytest.mark.parametrize("preset", ["prim", "paper"])
-@pytest.mark.parametrize("kind", ["circle", "triangle"])
-def test_an_exported_network_gives_torch_s_numbers(tmp_path: Path, preset: str, kind: str) -> None:
+@pytest.mark.parametrize("kinds", [("circle",), ("triangle",), ALL_KINDS], ids=["circle", "triangle", "all"])
+def test_an_exported_network_gives_torch_s_numbers(tmp_path: Path, preset: str, kinds: tuple[str, ...]) -> None:
     torch = pytest.importorskip("torch", reason="needs the extra [train]")
     pytest.importorskip("onnx", reason="needs the extra [train]")
     from dataclasses import asdict
@@ -58,11 +58,11 @@ def test_an_exported_network_gives_torch_s_numbers(tmp_path: Path, preset: str, 
     from prim.shapes import Kind
 
     torch.manual_seed(1)
-    network = ParameterNetwork([Kind(kind)], PRESETS[preset])
+    network = ParameterNetwork([Kind(kind) for kind in kinds], PRESETS[preset])
     network.eval()
     state = {
         "options": asdict(CnnOptions(preset)),
-        "kinds": [kind],
+        "kinds": list(kinds),
         "mapper": "forward",
         "style": "grey",
         "network": network.state_dict(),
@@ -72,7 +72,7 @@ def test_an_exported_network_gives_torch_s_numbers(tmp_path: Path, preset: str, 
         export_cnn(tmp_path / "a.pt", "det", tmp_path / "a.onnx")
     export_cnn(tmp_path / "a.pt", "forward", tmp_path / "a.onnx")
     weights = load_weights(tmp_path / "a.onnx", "cnn", "forward")
-    assert (weights.card.kinds, weights.card.preset) == ((kind,), preset)
+    assert (weights.card.kinds, weights.card.preset) == (kinds, preset)
     crops = np.random.default_rng(0).random((5, 1, *[PRESETS[preset].pixels] * 2), dtype=np.float32)
     outputs = weights.session.run(None, {"crops": crops})[0]
     with torch.no_grad():
