@@ -291,6 +291,9 @@ def _evaluate(
         Path | None,
         typer.Option(metavar="FOLDER", help="Of --suite shipped: weights, a folder a mapper. [default: prim's own]"),
     ] = None,
+    so_far: Annotated[
+        bool, typer.Option("--so-far", help="Of --suite paper: report what is measured, train nothing.")
+    ] = False,
     sessions: Annotated[int, typer.Option(metavar="N", help="Of --suite shipped: sessions a row.", min=1)] = 500,
     output: Annotated[
         Path | None, typer.Option(metavar="FOLDER", help="Where the report goes. [default: report, in FOLDER]")
@@ -319,8 +322,11 @@ def _evaluate(
         from detect.suite import Suite
         from detect.tables import report
 
-        written = report(Suite(work, say).run(), folder)
+        made = Suite(work, say)
+        written = report(made.measured() if so_far else made.run(), folder)
     else:
+        if so_far:
+            raise UsageError("--so-far goes with --suite paper")
         from detect.suite import ShippedSuite
         from detect.tables import report_shipped
 

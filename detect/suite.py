@@ -64,6 +64,11 @@ class Case:
         """Its test set."""
         return f"test-{self.test_mm}"
 
+    @property
+    def alone(self) -> tuple[Kind, ...]:
+        """The kinds it is tested on alone as well: all, where it was trained on the noise that it is tested on."""
+        return tuple(Kind) if self.train_mm == self.test_mm else ()
+
 
 def cases() -> Iterator[Case]:
     """The paper's eight rows, and the same for the forward mapper, under both readings."""
@@ -84,6 +89,19 @@ class Suite:
     def __init__(self, work: Path, say: Say) -> None:
         self.work, self.say = work, say
 
+    def measured(self) -> list[tuple[Case, dict[str, Any], dict[str, dict[str, Any]]]]:
+        """What :meth:`run` has measured so far; makes nothing. Raises UsageError where that is nothing."""
+        found = []
+        for case in cases():
+            alone = {kind: read(self.result(case, case.test + single(kind))) for kind in case.alone}
+            whole = read(self.result(case, case.test))
+            if whole is not None:
+                each = {kind.value: value for kind, value in alone.items() if value is not None}
+                found.append((case, whole, each if len(each) == len(Kind) else {}))
+        if not found:
+            raise UsageError(f"nothing has been measured in {self.work} yet")
+        return found
+
     def run(self) -> list[tuple[Case, dict[str, Any], dict[str, dict[str, Any]]]]:
         """Makes what is missing; returns each case with its evaluation, and those on maps with one kind alone.
 
@@ -92,16 +110,18 @@ class Suite:
         found = []
         for case in cases():
             self.networks(case)
-            alone = {}
-            if case.train_mm == case.test_mm:
-                alone = {kind.value: self.evaluated(case, case.test + single(kind)) for kind in Kind}
+            alone = {kind.value: self.evaluated(case, case.test + single(kind)) for kind in case.alone}
             found.append((case, self.evaluated(case, case.test), alone))
         return found
 
     def evaluated(self, case: Case, test: str) -> dict[str, Any]:
         """The evaluation of a case's networks on a set."""
-        path = self.work / "results" / f"{case.network}.{test}.json"
+        path = self.result(case, test)
         return evaluated(path, self.networks(case), case.row.mapper, lambda: self.tests(test), self.say)
+
+    def result(self, case: Case, test: str) -> Path:
+        """Where an evaluation is kept."""
+        return self.work / "results" / f"{case.network}.{test}.json"
 
     def networks(self, case: Case) -> Path:
         """The folder of a case's networks, trained."""
@@ -191,6 +211,15 @@ def evaluated(path: Path, networks: Path, mapper: str, data: Callable[[], Path],
         say(f"evaluating {path.stem}")
         path.parent.mkdir(parents=True, exist_ok=True)
         write(path, json.dumps(evaluate(detector, chosen).to_json(), indent=1))
+    value = read(path)
+    assert value is not None
+    return value
+
+
+def read(path: Path) -> dict[str, Any] | None:
+    """An evaluation that is kept; None where there is none."""
+    if not path.exists():
+        return None
     value: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
     return value
 

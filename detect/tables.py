@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from detect.paper import ROWS, SHAPES, TABLE_1, TABLE_2, TESTED, Row
-from detect.suite import Case, Condition, write
+from detect.suite import READINGS, Case, Condition, cases, write
 
 Result = tuple[Case, dict[str, Any], dict[str, dict[str, Any]]]
 """A case, its evaluation, and its evaluations on maps with one kind alone."""
@@ -101,6 +101,9 @@ def _in_units(errors: dict[str, Any] | None, name: str) -> float | None:
 def _markdown(results: Sequence[Result]) -> Iterator[str]:
     """The report: what was done, the lines for all shapes, then each shape's."""
     yield from _introduction()
+    missing = len(list(cases())) - len(results)
+    if missing:
+        yield f"\n**{missing} of {missing + len(results)} rows are not measured yet, and are left out.**"
     for reading in dict.fromkeys(case.reading for case, _, _ in results):
         own = [result for result in results if result[0].reading == reading]
         yield f"\n## Noise {reading}: n = 0.05 is {_std(own)} mm\n"
@@ -113,12 +116,14 @@ def _markdown(results: Sequence[Result]) -> Iterator[str]:
         yield from _boxes_table(own, SHAPES[1:])
         yield ""
         yield from _errors_table(own, SHAPES[1:])
-        yield f"\n### Maps with one shape alone ({reading})\n"
-        yield from _alone_table(own)
+        if any(alone for _, _, alone in own):
+            yield f"\n### Maps with one shape alone ({reading})\n"
+            yield from _alone_table(own)
 
 
 def _std(results: Sequence[Result]) -> int:
-    return next(case.train_mm for case, _, _ in results if case.row.train == 0.05)
+    """The standard deviation (mm) of n = 0.05 under a reading."""
+    return round(50 * READINGS[results[0][0].reading])
 
 
 def _introduction() -> Iterator[str]:
@@ -225,7 +230,7 @@ def _plot(results: Sequence[Result], path: Path) -> None:
                 at = [case.row.test for case, _ in own]
                 axis.plot(at, [f["boxes"]["all"][name] for _, f in own], "o-", color=colour, label=mapper)
                 paper = [_paper(case.row, "all")[0].get(name) for case, _ in own]
-                if None not in paper:
+                if paper and None not in paper:
                     axis.plot(at, paper, "x:", color=colour, label=f"{mapper}, the paper's")
             axis.set(xlabel="noise n tested", ylabel=f"{BOXES[name]}, all shapes", ylim=(0, 1))
             axis.set_title(f"trained n = 0.05, noise {reading}", fontsize=10)

@@ -123,6 +123,19 @@ def test_a_suite_goes_on_where_it_stopped(tmp_path: Path) -> None:
             (tmp_path / "results").mkdir(exist_ok=True)
             (tmp_path / "results" / f"{case.network}.{case.test}{kind}.json").write_text(json.dumps(made_up(0.5)))
     assert len(made.run()) == 26 and said == []
+    assert made.measured() == made.run()
+    for path in (tmp_path / "results").glob("prob-*"):
+        path.unlink()
+    assert len(made.measured()) == 20  # what is there, and nothing is made
+    with pytest.raises(UsageError, match="nothing has been measured"):
+        suite.Suite(tmp_path / "none", said.append).measured()
+
+
+def test_a_report_of_a_part_says_what_is_missing(tmp_path: Path) -> None:
+    pytest.importorskip("matplotlib", reason="needs the extra [train]")
+    case = next(suite.cases())
+    markdown, _, _ = tables.report([(case, made_up(0.9), {})], tmp_path)
+    assert "25 of 26 rows are not measured yet" in markdown.read_text()
 
 
 def test_a_set_with_other_options_is_not_taken(tmp_path: Path) -> None:
