@@ -263,12 +263,9 @@ def every(
     Takes hours, and says how long each part took; an interrupted run goes on.
     """
     need_extra()
-    from detect.recipe import MIXED, make_set, make_start, make_weights
+    from detect.recipe import make_all
 
-    start, data = make_start(work, typer.echo), make_set(work / "mixed", MIXED, typer.echo)
-    about = {"sessions": MIXED.sizes[0], "seed": MIXED.seed, "noise_std_m": MIXED.noise_stds}
-    for name in mapper or list(MapperName):
-        made = make_weights(data, name.value, work / "weights" / name.value, "prim", start, typer.echo, about)
+    for made in make_all(work, [name.value for name in mapper or list(MapperName)], typer.echo):
         typer.echo(f"made: {made}")
     return 0
 

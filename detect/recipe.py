@@ -7,7 +7,7 @@ FOLDER/yolo.onnx  FOLDER/cnn*.onnx            what it ends with: see detect.weig
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
@@ -25,6 +25,9 @@ MIXED = PRESETS["mixed"]
 
 WORTH_SAYING = 5.0
 """What takes no longer than this (s) was there already."""
+
+FIRST = "forward"
+"""The mapper whose networks are trained first: its maps show most."""
 
 Say = Callable[[str], None]
 
@@ -57,9 +60,19 @@ def make_set(folder: Path, options: SetOptions, say: Say) -> Path:
 
 
 def make_weights(
-    data: Path, mapper: str, folder: Path, preset: str, start: Path, say: Say, about: Mapping[str, Any] | None = None
+    data: Path,
+    mapper: str,
+    folder: Path,
+    preset: str,
+    start: Path,
+    say: Say,
+    about: Mapping[str, Any] | None = None,
+    cnn_start: Path | None = None,
 ) -> Path:
-    """Trains all networks on a set, with thresholds from its validation split; what is there is not made again."""
+    """Trains all networks on a set, with thresholds from its validation split; what is there is not made again.
+
+    ``start`` is what YOLO begins from, ``cnn_start`` the checkpoint that our one CNN begins from, or None.
+    """
     if (folder / DETECTOR).exists():
         return folder
     from detect.export import export_cnn, export_yolo
@@ -74,7 +87,7 @@ def make_weights(
         name = "cnn" if len(kinds) == len(Kind) else f"cnn.{'-'.join(kinds)}"
         checkpoint = folder / checkpoint_name(mapper, kinds)
         with _timed(f"{folder.name}: {name}", say):
-            train_cnn(data, mapper, kinds, checkpoint, CNN_PRESETS[preset])
+            train_cnn(data, mapper, kinds, checkpoint, replace(CNN_PRESETS[preset], start=cnn_start))
         export_cnn(checkpoint, mapper, folder / f"{name}.onnx", about)
     part = folder / "yolo.part"
     export_yolo(best, mapper, part, True, style, about)
@@ -90,3 +103,19 @@ def put_thresholds(yolo: Path, data: Path) -> None:
     weights = load_weights(yolo, "yolo")
     chosen = choose_thresholds(Yolo(weights), samples(data, weights.card.mapper, "val"))
     write_card(yolo, replace(weights.card, thresholds=chosen))
+
+
+def make_all(work: Path, mappers: Sequence[str], say: Say) -> Iterator[Path]:
+    """The weights that come with prim, each mapper's in a folder of its own.
+
+    The first mapper's networks, FIRST's, begin from drawings; the others' from these, since all maps look alike.
+    """
+    start, data = make_start(work, say), make_set(work / "mixed", MIXED, say)
+    about = {"sessions": MIXED.sizes[0], "seed": MIXED.seed, "noise_std_m": MIXED.noise_stds}
+    first = make_weights(data, FIRST, work / "weights" / FIRST, "prim", start, say, about)
+    for mapper in mappers:
+        folder = work / "weights" / mapper
+        if mapper != FIRST:
+            yolo, cnn = first / "yolo" / "weights" / "best.pt", first / f"cnn.{FIRST}.pt"
+            make_weights(data, mapper, folder, "transfer", yolo, say, about, cnn)
+        yield folder

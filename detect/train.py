@@ -36,7 +36,7 @@ Progress = Callable[[int, int, float, float], None]
 
 @dataclass(frozen=True)
 class CnnOptions:
-    """How one kind's network is trained. Raises UsageError on what cannot be."""
+    """How a network is trained: from nothing, or from another's checkpoint. Raises UsageError on what cannot be."""
 
     preset: str = PRIM.name
     epochs: int = 30
@@ -45,6 +45,7 @@ class CnnOptions:
     channels: int = 1
     vary: bool = True
     seed: int = 0
+    start: Path | None = None
 
     def __post_init__(self) -> None:
         if self.preset not in PRESETS:
@@ -55,8 +56,13 @@ class CnnOptions:
             raise UsageError(f"{self.channels} channels: grey has 1, the paper's images 3")
 
 
-CNN_PRESETS = {PRIM.name: CnnOptions(), PAPER.name: CnnOptions(PAPER.name, epochs=20, vary=False)}
-"""Ours; and the paper's (IV-B: 20 epochs, batch 128, Adam, learning rate 0.001, the crops as they are)."""
+CNN_PRESETS = {
+    PRIM.name: CnnOptions(),
+    "transfer": CnnOptions(epochs=10, learning_rate=0.0005),
+    PAPER.name: CnnOptions(PAPER.name, epochs=20, vary=False),
+}
+"""Ours, from nothing and from another mapper's network; and the paper's (IV-B: 20 epochs, batch 128, Adam, learning
+rate 0.001, the crops as they are)."""
 
 
 def networks_of(preset: str, kinds: Sequence[Kind]) -> list[tuple[Kind, ...]]:
@@ -86,11 +92,13 @@ def train_cnn(
     if not len(training):
         raise UsageError(f"{data} holds no {' or '.join(kinds)} to learn from")
     network = ParameterNetwork(kinds, PRESETS[options.preset], options.channels)
+    if options.start is not None:
+        network.load_state_dict(_weights_of(options.start, network))
     network.to(memory_format=torch.channels_last)  # what convolutions on a CPU are three times faster with
     optimizer = torch.optim.Adam(network.parameters(), lr=options.learning_rate)
     schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, options.epochs)
     asked = {
-        "options": asdict(options),
+        "options": _plain(asdict(options)),
         "kinds": [kind.value for kind in kinds],
         "mapper": mapper,
         "style": style_of(data, mapper),
@@ -107,6 +115,18 @@ def train_cnn(
             progress(epoch + 1, options.epochs, loss, evaluate_cnn(network, validation))
     network.eval()
     return network
+
+
+def _weights_of(checkpoint: Path, network: ParameterNetwork) -> Any:
+    """Another network's weights. Raises UsageError where it is not of the same make; nothing in the file is run."""
+    try:
+        state = torch.load(checkpoint, weights_only=True)
+        same = state["kinds"] == [kind.value for kind in network.kinds]
+        if same and state["options"]["preset"] == network.preset.name:
+            return state["network"]
+    except Exception as error:  # torch raises many kinds on files that are none of its own
+        raise UsageError(f"{checkpoint} is no checkpoint of prim-train cnn") from error
+    raise UsageError(f"{checkpoint} is of a network for other kinds, or of another preset")
 
 
 def _epoch(
@@ -227,10 +247,12 @@ class YoloOptions:
 
 YOLO_PRESETS = {
     "prim": YoloOptions(),
+    "transfer": YoloOptions(epochs=8, learning_rate=0.001),
     "paper": YoloOptions(epochs=32, image_size=224, optimizer="SGD", learning_rate=0.01, turn=False),
     "drawings": YoloOptions(epochs=3, mosaic=False, turn=False),
 }
-"""Ours; the paper's (IV-B: 32 epochs, batch 32, SGD, learning rate 0.01); and one for detect.drawings, which vary."""
+"""Ours, from drawings and from another mapper's network; the paper's (IV-B: 32 epochs, batch 32, SGD, learning rate
+0.01); and one for detect.drawings, which vary by themselves."""
 
 
 def train_yolo(data: Path, mapper: str, output: Path, options: YoloOptions) -> Path:

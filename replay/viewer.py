@@ -62,6 +62,7 @@ SCAN_COLOR = (255, 80, 60)
 TRAIL_COLOR = (40, 110, 220)
 LASER_COLOR = (40, 110, 220)
 TRUTH_COLOR = (150, 150, 150)
+LABEL_COLOR = (255, 255, 255)
 
 SCORES = {
     "occupied_f1": ("occupied F1", (255, 255, 255)),
@@ -184,7 +185,8 @@ class RerunViewer:
         self._send_batch()
         self._at(position, stamp)
         found = sighting.detections.found
-        self._recording.log("map/detections", self._outlines(sighting))
+        self._recording.log("map/detections", self._outlines(found))
+        self._recording.log("map/labels", self._labels(sighting))
         self._recording.log("detections", rr.TextDocument(_detections_table(sighting), media_type="text/markdown"))
         self._recording.log("crops", rr.Image(_crops(found)))
         errors = sighting.errors
@@ -194,16 +196,25 @@ class RerunViewer:
             angle = math.nan if errors.angle is None else math.degrees(errors.angle)
             self._recording.log("errors/angle", rr.Scalars([angle]))
 
-    def _outlines(self, sighting: Sighting) -> Any:
-        """Found primitives as outlines in their kind's colour: id, kind, score; «?» while a track is tentative."""
-        found = sighting.detections.found
-        names = [f"{one.id}{'' if one.confirmed else '?'}" for one in sighting.identities]
+    def _outlines(self, found: Sequence[Detection]) -> Any:
+        """Found primitives as outlines in their kind's colour."""
         rings = [np.vstack((ring := one.primitive.outline(64), ring[:1])) for one in found]
         return rr.LineStrips3D(
             [self._lifted(ring, FOUND_LIFT) for ring in rings],
-            labels=[f"{name}: {one.primitive.kind} {one.score:.2f}" for name, one in zip(names, found, strict=True)],
             colors=[KIND_COLORS[one.primitive.kind] for one in found],
             radii=rr.Radius.ui_points(2.0),
+        )
+
+    def _labels(self, sighting: Sighting) -> Any:
+        """Id, kind and score above each found primitive; «?» while its track is tentative."""
+        found = sighting.detections.found
+        names = [f"{one.id}{'' if one.confirmed else '?'}" for one in sighting.identities]
+        tops = [(one.primitive.x, float(one.primitive.outline(64)[:, 1].max())) for one in found]
+        return rr.Points3D(
+            self._lifted(np.array(tops).reshape(-1, 2), FOUND_LIFT),
+            labels=[f"{name}: {one.primitive.kind} {one.score:.2f}" for name, one in zip(names, found, strict=True)],
+            colors=[LABEL_COLOR],
+            radii=rr.Radius.ui_points(0.0),
             show_labels=True,
         )
 

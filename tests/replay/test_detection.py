@@ -82,9 +82,11 @@ def test_detection_on_the_way_is_on_the_timeline(noisy_session: Session, knowing
     outlines = timed(rows["/map/detections"])
     wanted = [*range(9, result.scans, 10)]
     assert sorted({row["scan"] for row in outlines}) == sorted({*wanted, result.scans - 1})
-    labels = value(outlines[0], "labels")
-    assert labels[0] == f"1?: {noisy_session.world.primitives[0].kind} 0.90"  # tentative when seen once
-    assert value(outlines[-1], "labels")[0] == f"1: {noisy_session.world.primitives[0].kind} 0.90"
+    labels = timed(rows["/map/labels"])
+    assert (
+        value(labels[0], "labels")[0] == f"1?: {noisy_session.world.primitives[0].kind} 0.90"
+    )  # tentative when seen once
+    assert value(labels[-1], "labels")[0] == f"1: {noisy_session.world.primitives[0].kind} 0.90"
     lengths = value(timed(rows["/errors/lengths"])[-1], "scalars")
     assert lengths == pytest.approx([10.0, 0.0, 0.0], abs=1e-6)
     assert value(timed(rows["/errors/found"])[-1], "scalars")[0] == pytest.approx(1.0)
