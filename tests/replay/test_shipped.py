@@ -1,0 +1,60 @@
+"""The weights that come with prim, on a log nobody here wrote and on recorded sessions."""
+
+from __future__ import annotations
+
+import math
+import tomllib
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from detect.weights import load_set
+from mapping.mapper import MAPPERS
+from prim.frames import Pose2D
+from prim.shapes import Kind
+from recorder.session import Session
+from replay.lookout import SHIPPED, shipped_weights
+from replay.pipeline import Pipeline, ReplayOptions
+
+ROOT = Path(__file__).parents[2]
+PILLARS = [(x, y) for x in (-0.6, 0.6) for y in (-0.6, 0.6)]
+
+shipped = [mapper for mapper in MAPPERS if shipped_weights(mapper) is not None]
+
+
+def test_weights_come_with_prim() -> None:
+    """Small enough, each with a card that says what it was made of, and part of the package."""
+    assert "forward" in shipped
+    files = sorted(SHIPPED.rglob("*.onnx"))
+    assert sum(path.stat().st_size for path in files) < 25e6
+    package = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["setuptools"]["package-data"]["detect"]
+    assert {path for pattern in package for path in (ROOT / "detect").glob(pattern)} >= set(files)
+    for mapper in shipped:
+        yolo, networks = load_set(SHIPPED / mapper, mapper)
+        assert set(yolo.card.thresholds) == set(Kind)
+        assert all(weights.card.about["seed"] for weights in (yolo, *networks))
+
+
+@pytest.mark.parametrize("mapper", shipped)
+def test_four_pillars(real_log: Callable[[str], Path], mapper: str) -> None:
+    """Radius 0.15 m at (±0.6, ±0.6), in a simulator that is not ours; and nothing else."""
+    options = ReplayOptions(mapper=mapper, laser_offset=Pose2D(-0.032, 0.0, 0.0))
+    sighting = Pipeline(real_log("pillars4.mcap"), options).run().sighting
+    assert sighting is not None
+    found = [one.primitive for one in sighting.detections.found]
+    assert [one.kind for one in found] == [Kind.CIRCLE] * 4
+    for x, y in PILLARS:
+        nearest = min(found, key=lambda one: math.hypot(one.x - x, one.y - y))
+        assert math.hypot(nearest.x - x, nearest.y - y) < 0.025
+        assert nearest.size[0] == pytest.approx(0.15, abs=0.015)
+
+
+@pytest.mark.parametrize("mapper", shipped)
+def test_a_recorded_session(quiet_session: Session, mapper: str) -> None:
+    """One primitive of each kind, no noise: most are found, and what is found is where it is."""
+    sighting = Pipeline(quiet_session.path, ReplayOptions(mapper=mapper)).run().sighting
+    assert sighting is not None and sighting.errors is not None
+    errors = sighting.errors
+    assert errors.precision >= 0.8 and errors.recall >= 0.8
+    assert errors.position is not None and errors.position < 0.02
