@@ -7,6 +7,8 @@ Two ways of doing it, one for each preset:
 - ``prim``: a window of 72 x 72 cells around the box's centre, at the map's own resolution, with what lies around the
   primitive left in; an angle is two outputs, the cosine and the sine of the angle times the kind's symmetry, so that
   no angle is torn apart where it wraps around; two more say how far the centroid lies from the window's middle.
+  A triangle's angle would be torn apart where it is equilateral and any corner may be the apex. Its corners are the
+  roots of z³ + p z + q (complex numbers around the centroid, in any order): p and q are its outputs, as lengths.
 """
 
 from __future__ import annotations
@@ -52,6 +54,10 @@ class Preset:
     def angles(self, kind: Kind) -> int:
         """How many of a kind's outputs tell its angle: they come first."""
         return 0 if kind not in TURNS else 2 if self.vector else 1
+
+    def lengths(self, kind: Kind) -> int:
+        """The first of a kind's outputs that are lengths; those before it are a cosine and a sine, or a share."""
+        return 0 if self.vector and kind is Kind.TRIANGLE else self.angles(kind)
 
     def outputs(self, kind: Kind) -> int:
         """How many numbers tell a kind's parameters: angle, offset, sizes."""
@@ -106,17 +112,45 @@ def shrink(window: NDArray[np.uint8], pixels: int) -> NDArray[np.uint8]:
     return np.asarray(np.rint(blocks.mean(axis=(1, 3))), dtype=np.uint8)
 
 
+def triangle_outputs(primitive: Primitive) -> list[float]:
+    """The coefficients p / |q|^(1/3) and q / |q|^(2/3) (m, complex) of the polynomial whose roots are the corners."""
+    corners = primitive.outline() - (primitive.x, primitive.y)
+    z = corners[:, 0] + 1j * corners[:, 1]
+    p, q = -(z**2).sum() / 2, -(z**3).sum() / 3
+    scale = abs(q) ** (1 / 3)
+    return [float(value) for one in (p / scale, q / scale**2) for value in (one.real, one.imag)]
+
+
+def read_triangle(outputs: Sequence[float]) -> tuple[float, list[float]]:
+    """Angle (rad), base and height (m) of the isosceles triangle that :func:`triangle_outputs` tell.
+
+    The apex is the corner whose sides are most alike.
+    """
+    q = complex(outputs[2], outputs[3])
+    scale = abs(q)
+    z = np.roots([1.0, 0.0, complex(outputs[0], outputs[1]) * scale, q * scale**2])
+    unlike = [abs(abs(z[k] - z[k - 1]) - abs(z[k] - z[k - 2])) for k in range(3)]
+    apex = int(np.argmin(unlike))
+    left, right = z[apex - 1], z[apex - 2]
+    up = z[apex] - (left + right) / 2
+    return math.atan2(up.imag, up.real) - math.pi / 2, [float(abs(left - right)), float(abs(up))]
+
+
 def targets(primitive: Primitive, preset: Preset) -> NDArray[np.float32]:
     """What a network should give for a primitive, whose place (m) is given from the middle of its crop's window."""
     values: list[float] = []
     turns = TURNS.get(primitive.kind)
-    if turns is not None:
+    sizes = [size / LONGEST for size in primitive.size]
+    if preset.vector and primitive.kind is Kind.TRIANGLE:
+        told = [value / LONGEST for value in triangle_outputs(primitive)]
+        values, sizes = told[:2], told[2:]
+    elif turns is not None:
         theta = primitive.theta or 0.0
         period = 2 * math.pi / turns
         values = [math.cos(turns * theta), math.sin(turns * theta)] if preset.vector else [theta % period / period]
     if preset.offset:
         values += [primitive.x / LONGEST, primitive.y / LONGEST]
-    return np.array([*values, *(size / LONGEST for size in primitive.size)], dtype=np.float32)
+    return np.array([*values, *sizes], dtype=np.float32)
 
 
 def read_outputs(kind: Kind, outputs: Sequence[float], preset: Preset, box: Box, tile: GridFrame) -> Primitive:
@@ -128,10 +162,13 @@ def read_outputs(kind: Kind, outputs: Sequence[float], preset: Preset, box: Box,
     first = preset.angles(kind)
     turns = TURNS.get(kind)
     theta = None
-    if turns is not None:
+    sizes = [float(value) * LONGEST for value in outputs[preset.outputs(kind) - SIZES[kind] :]]
+    if preset.vector and kind is Kind.TRIANGLE:
+        theta, sizes = read_triangle([*(float(value) * LONGEST for value in outputs[:2]), *sizes])
+    elif turns is not None:
         period = 2 * math.pi / turns
         theta = math.atan2(outputs[1], outputs[0]) / turns if preset.vector else outputs[0] * period
-    size = tuple(max(float(value) * LONGEST, 0.001) for value in outputs[preset.outputs(kind) - SIZES[kind] :])
+    size = tuple(max(value, 0.001) for value in sizes)
     if preset.offset:
         x, y = preset.centre(box, tile)
         x, y = x + outputs[first] * LONGEST, y + outputs[first + 1] * LONGEST

@@ -181,7 +181,7 @@ def _loss(network: ParameterNetwork, outputs: torch.Tensor, primitives: Sequence
         wanted[row, span] = targets(primitive, preset)
         weight[row, span] = 1.0 / preset.outputs(primitive.kind)
         if preset.vector:
-            weight[row, span.start + preset.angles(primitive.kind) : span.stop] *= LENGTH_WEIGHT
+            weight[row, span.start + preset.lengths(primitive.kind) : span.stop] *= LENGTH_WEIGHT
     goal = torch.from_numpy(wanted)
     if preset.vector:
         errors = torch.nn.functional.huber_loss(outputs, goal, reduction="none", delta=HUBER)

@@ -8,14 +8,25 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import shapely
-from hypothesis import given
+from hypothesis import assume, given
 from hypothesis import strategies as st
 
 from detect.crops import Crops, mirrored, turned
 from detect.dataset import box_of, share_inside, yolo_line
-from detect.parameters import LONGEST, PAPER, PRIM, Preset, crop, read_outputs, targets
+from detect.parameters import (
+    LONGEST,
+    PAPER,
+    PRIM,
+    Preset,
+    crop,
+    read_outputs,
+    read_triangle,
+    targets,
+    triangle_outputs,
+)
 from detect.tiles import TILE, cut, tiles
 from mapping.grid import GridFrame, OccupancyGrid
+from prim.metrics import polygon_iou
 from prim.shapes import Kind, Primitive, angle_error
 from prim.world import World
 
@@ -135,3 +146,20 @@ def test_share_inside() -> None:
     assert share_inside(only_its_base, FRAME) == pytest.approx(0.266, abs=0.001)
     assert math.isclose(share_inside(SHAPES[0], FRAME), 1.0)
     assert World((2, 2), ()).bounds == (-1, -1, 1, 1)
+
+
+@given(base=st.floats(0.1, 0.3), leg=st.floats(0.1, 0.3), theta=st.floats(0, 6.28), turn=st.floats(-0.02, 0.02))
+def test_a_triangles_outputs_change_little_where_it_changes_little(
+    base: float, leg: float, theta: float, turn: float
+) -> None:
+    """Also where it is nearly equilateral and its apex jumps: what a network learns has no tears."""
+    assume(leg > base / 2 * 1.1)
+    shape = Primitive(Kind.TRIANGLE, 0.3, -0.2, theta, (base, math.sqrt(leg**2 - base**2 / 4)))
+    angle, (width, height) = read_triangle(triangle_outputs(shape))
+    told = Primitive(Kind.TRIANGLE, 0.3, -0.2, angle, (width, height)).canonical()
+    assert polygon_iou(told, shape) > 0.999
+    other = replace(shape, theta=theta + turn, size=(shape.size[0] + turn / 10, shape.size[1]))
+    assert np.abs(np.subtract(triangle_outputs(other), triangle_outputs(shape))).max() < 0.03
+    third = replace(shape, theta=theta + 2 * math.pi / 3)
+    if abs(base - leg) < 1e-6:
+        assert triangle_outputs(third) == pytest.approx(triangle_outputs(shape), abs=1e-4)
