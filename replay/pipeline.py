@@ -97,7 +97,7 @@ class ReplayOptions:
 
 @dataclass(frozen=True)
 class ReplayResult:
-    """All that a replay found out."""
+    """All that a replay found out; ``blind`` says why primitives were not looked for, where they should have been."""
 
     path: Path
     options: ReplayOptions
@@ -115,6 +115,7 @@ class ReplayResult:
     noise_std: float | None
     scores: MapScores | None
     sighting: Sighting | None
+    blind: str | None
     seconds: dict[str, float]
 
 
@@ -170,6 +171,7 @@ class Pipeline:
         self._progress = progress or (lambda done, total: None)
         self._clock = Clock()
         self._notes: list[str] = []
+        self._blind: str | None = None
 
     def run(self) -> ReplayResult:
         """The whole replay. Raises LogReadError, UsageError, OutputError."""
@@ -288,7 +290,7 @@ class Pipeline:
         return make_mapper(options.mapper, options.resolution, frame.bounds, options.sensor_model, noise_std)
 
     def _lookout(self, frame: GridFrame, truth: Truth | None) -> Lookout | None:
-        """What looks for primitives; None, and a note, where it cannot and nobody asked for it by name."""
+        """What looks for primitives; None, and the reason kept, where it cannot and nobody asked for it by name."""
         options = self.options
         if not options.detect:
             return None
@@ -301,7 +303,7 @@ class Pipeline:
         except UsageError as error:
             if asked:
                 raise
-            self._notes.append(f"primitives are not looked for: {error}")
+            self._blind = str(error)
             return None
 
     def _loaded(self, weights: Path, frame: GridFrame, truth: Truth | None) -> Lookout:
@@ -456,6 +458,7 @@ class Pipeline:
             noise_std=noise_std,
             scores=scores,
             sighting=sighting,
+            blind=self._blind,
             seconds=self._clock.seconds | {"total": self._clock.total()},
         )
 

@@ -194,6 +194,8 @@ def table(result: ReplayResult) -> list[tuple[str, str]]:
         rows.append(("primitives", _counted(result.sighting)))
         if result.sighting.errors is not None:
             rows += _quality(result.sighting.errors)
+    if result.blind is not None:
+        rows.append(("primitives", f"not looked for: {result.blind}"))
     rate = result.rays / seconds["map"] / 1e6 if seconds["map"] else 0.0
     rows.append(("time", f"{seconds['total']:.2f} s, mapping {seconds['map']:.3f} s ({rate:.2f} M rays/s)"))
     return rows

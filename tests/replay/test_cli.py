@@ -15,6 +15,7 @@ from mapping.mapper import MAPPERS
 from prim import console
 from recorder.session import Session
 from replay.cli import app, join_bounds
+from replay.lookout import shipped_weights
 
 Run = Callable[..., tuple[int, str, str]]
 
@@ -67,19 +68,28 @@ def test_a_plain_replay_leaves_a_recording_and_a_report(replay: Run, noisy_sessi
     assert set(report["map"]["scores"]) == {
         *("occupied_precision", "occupied_recall", "occupied_f1", "free_accuracy", "auc")
     }
-    assert report["primitives"] == []
-    assert report["errors"] is None
+    assert [one["id"] for one in report["primitives"]] == [*range(1, len(report["primitives"]) + 1)]
+    assert (report["errors"] is not None) == (shipped_weights(mapper) is not None)
     assert set(report["timing"]) == {
         *("read_s", "localize_s", "map_s", "detect_s", "refine_s", "viewer_s", "total_s"),
         *("rays_per_s", "x_realtime"),
     }
 
 
-def test_no_viewer_writes_no_recording_and_imports_no_rerun(noisy_session: Session, tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("option", "heavy"),
+    [
+        ("--quiet", {"rerun", "torch", "ultralytics", "matplotlib", "scipy"}),
+        ("--no-detect", {"rerun", "torch", "ultralytics", "matplotlib", "scipy", "shapely", "onnxruntime"}),
+    ],
+)
+def test_no_viewer_writes_no_recording_and_imports_no_rerun(
+    noisy_session: Session, tmp_path: Path, option: str, heavy: set[str]
+) -> None:
     code = (
-        "import sys; from replay.cli import main; sys.argv[1:] = [sys.argv[1], '--no-viewer', '--quiet']\n"
+        f"import sys; from replay.cli import main; sys.argv[1:] = [sys.argv[1], '--no-viewer', '--quiet', '{option}']\n"
         "try: main()\nexcept SystemExit as stop: assert not stop.code, stop.code\n"
-        "bad = {'rerun', 'torch', 'ultralytics', 'matplotlib', 'shapely'} & set(sys.modules)\n"
+        f"bad = {heavy} & set(sys.modules)\n"
         "assert not bad, bad"
     )
     done = subprocess.run(

@@ -19,7 +19,7 @@ from prim.shapes import Kind
 from recorder.session import Session
 from replay import cli
 from replay.pipeline import Pipeline, ReplayOptions, ReplayResult
-from replay.report import report
+from replay.report import report, table
 from replay.show import ViewerOptions
 from replay.viewer import RerunViewer
 from tests.replay.test_viewer import rows_of, timed, value
@@ -137,10 +137,10 @@ def test_weights_that_cannot_be_used(
     assert said in error and error.count("\n") == 1 and not list(Path().glob("*.rrd*"))
 
 
-def test_without_weights_a_note_says_so(noisy_session: Session, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_weights_the_table_says_so(noisy_session: Session, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("replay.lookout.SHIPPED", Path("nowhere"))
     result = Pipeline(noisy_session.path, ReplayOptions()).run()
-    assert any("not looked for: no weights for maps of det" in note for note in result.notes)
+    assert "not looked for: no weights for maps of det" in dict(table(result))["primitives"] and not result.notes
     with pytest.raises(UsageError, match="give --weights"):
         Pipeline(noisy_session.path, ReplayOptions(detect_every=3)).run()
 
@@ -152,7 +152,7 @@ def test_a_map_that_is_too_large_for_the_detector(
     monkeypatch.setattr("mapping.grid.MAX_CELLS", 10_000)
     monkeypatch.setattr("replay.pipeline.shipped_weights", lambda mapper: Path("w"))
     result = Pipeline(noisy_session.path, ReplayOptions(resolution=0.05)).run()
-    assert any(note.startswith("primitives are not looked for: a map of") for note in result.notes)
+    assert dict(table(result))["primitives"].startswith("not looked for: a map of")
 
 
 def test_nothing_is_held_against_the_truth_where_poses_are_in_no_known_frame(
