@@ -79,15 +79,18 @@ def test_a_plain_replay_leaves_a_recording_and_a_report(replay: Run, noisy_sessi
 @pytest.mark.parametrize(
     ("option", "heavy"),
     [
-        ("--quiet", {"rerun", "torch", "ultralytics", "matplotlib", "scipy"}),
-        ("--no-detect", {"rerun", "torch", "ultralytics", "matplotlib", "scipy", "shapely", "onnxruntime"}),
+        ("--quiet", {"rerun", "torch", "ultralytics", "matplotlib", "filterpy"}),
+        (
+            "--quiet --no-detect",
+            {"rerun", "torch", "ultralytics", "matplotlib", "filterpy", "shapely", "onnxruntime"},
+        ),
     ],
 )
 def test_no_viewer_writes_no_recording_and_imports_no_rerun(
     noisy_session: Session, tmp_path: Path, option: str, heavy: set[str]
 ) -> None:
     code = (
-        f"import sys; from replay.cli import main; sys.argv[1:] = [sys.argv[1], '--no-viewer', '--quiet', '{option}']\n"
+        f"import sys; from replay.cli import main; sys.argv[2:] = '--no-viewer {option}'.split()\n"
         "try: main()\nexcept SystemExit as stop: assert not stop.code, stop.code\n"
         f"bad = {heavy} & set(sys.modules)\n"
         "assert not bad, bad"
