@@ -28,6 +28,9 @@ DEFAULT_THRESHOLD = 0.25
 OVERLAP_LIMIT = 0.45
 """Of two candidates that overlap by more than this (IoU), the better stays: YOLOv5's own."""
 
+COVER_LIMIT = 0.25
+"""Of two measured outlines that share more than this (of the smaller one's area), the better stays."""
+
 EDGE = 2
 """A box that comes this near (cells) to a tile's border, where the map goes on, is left to the next tile."""
 
@@ -118,16 +121,17 @@ class Detector:
         better = _suppressed(boxes, whole & (boxes.score >= least), [len(one.boxes) for one in looked])
         kept = np.flatnonzero(better == np.arange(len(boxes))).tolist()
         found = [_found(of[i], boxes, i) for i in kept]
-        detections = (
+        measured = _best_first(
             Detection(primitive, float(boxes.score[i]), _metres(boxes, i, frame), self.estimator.crop(one))
             for i, one, primitive in zip(kept, found, self.estimator(found), strict=True)
         )
+        detections, overlapping = _apart(measured)
         rejections = (
             _rejection(boxes, i, frame, self._reason(boxes, i, by, bool(whole[i])))
             for i, by in enumerate(better.tolist())
             if by != i
         )
-        return Detections(_best_first(detections), _best_first(rejections))
+        return Detections(detections, _best_first([*overlapping, *rejections]))
 
     def _look(self, images: Iterable[tuple[GridFrame, NDArray[np.uint8]]]) -> Iterator[_Looked]:
         """What YOLO sees in tiles, where it sees anything."""
@@ -161,6 +165,25 @@ def _suppressed(boxes: Boxes, among: NDArray[np.bool_], per_tile: Sequence[int])
     if len(per_tile) > 1:
         by[left] = left[suppress(boxes[left], OVERLAP_LIMIT)]
     return by
+
+
+def _apart(measured: Sequence[Detection]) -> tuple[tuple[Detection, ...], list[Rejection]]:
+    """Those, of detections best first, whose outlines keep clear of better ones: two things are not in one place."""
+    import shapely
+
+    outlines = [shapely.Polygon(one.primitive.outline(32)) for one in measured]
+    stay: list[int] = []
+    rejected = []
+    for i, one in enumerate(measured):
+        shared = [outlines[i].intersection(outlines[k]).area / min(outlines[i].area, outlines[k].area) for k in stay]
+        if max(shared, default=0.0) <= COVER_LIMIT:
+            stay.append(i)
+            continue
+        better = measured[stay[int(np.argmax(shared))]].primitive.kind
+        reason = f"its outline covers that of a better {better} by more than {COVER_LIMIT:g} of the smaller one"
+        x0, y0, x1, y1 = one.box
+        rejected.append(Rejection(one.primitive.kind, one.score, (x0 + x1) / 2, (y0 + y1) / 2, reason))
+    return tuple(measured[i] for i in stay), rejected
 
 
 def _found(looked: _Looked, boxes: Boxes, i: int) -> Found:

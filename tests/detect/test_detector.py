@@ -145,3 +145,20 @@ def test_many_are_suppressed_as_few_are(seed: int, per_kind: bool) -> None:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("detect.yolo.MANY", 10)
         assert suppress(boxes, 0.3, per_kind).tolist() == few.tolist()
+
+
+def test_two_primitives_are_not_in_one_place() -> None:
+    """Boxes that overlap little, with outlines that cover each other: the better one stays, the other says why."""
+
+    def answer(batch: np.ndarray) -> np.ndarray:
+        output = np.zeros((len(batch), 9, 2), np.float32)
+        output[:, :4, 0], output[:, :4, 1] = (50, 60, 8, 8), (57, 60, 8, 8)  # circles of radius 0.1 m, 0.07 m apart
+        output[:, 4 + 2, 0], output[:, 4 + 2, 1] = 0.9, 0.8
+        return output
+
+    made = detector()
+    made.yolo = Yolo(weights(Card("yolo", "det"), answer))
+    found = made.detect(grid_with((0.7, 1.3)))
+    assert [one.score for one in found.found] == [pytest.approx(0.9)]
+    (covered,) = found.rejected
+    assert covered.reason == "its outline covers that of a better circle by more than 0.25 of the smaller one"
