@@ -1,6 +1,6 @@
 """YOLO in less than single precision, or by another runtime: how fast, and what it costs in accuracy.
 
-    python -m bench.precision WEIGHTS SET [--update docs/detect.md]
+    python -m bench.precision WEIGHTS SET
 
 WEIGHTS is a folder of weights, SET a set of ``prim-train dataset``: int8 is calibrated on its training split,
 accuracy is of its validation split. Times are of one tile, on all cores, in turns. OpenVINO is tried where it is
@@ -20,7 +20,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bench.detect import timed
-from bench.maps import update
 from detect.dataset import Sample, samples
 from detect.evaluate import BATCH, Pictured, mark, read_image
 from detect.scores import score_boxes
@@ -156,7 +155,6 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("weights", type=Path)
     parser.add_argument("set", type=Path)
-    parser.add_argument("--update", type=Path)
     options = parser.parse_args()
     like = load_weights(options.weights / DETECTOR, "yolo")
     training, chosen = (samples(options.set, like.card.mapper, split) for split in ("train", "val"))
@@ -169,8 +167,6 @@ def main() -> None:
             scores = " | ".join(f"{value:.3f}" for value in accuracy(run, like, chosen))
             lines.append(f"| {name} | {times[name][0]:.1f} | {times[name][1]:.1f} | {scores} |")
     print("\n".join(lines))
-    if options.update:
-        update(options.update, "precision", "\n".join(lines))
 
 
 if __name__ == "__main__":
