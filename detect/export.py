@@ -120,7 +120,7 @@ def halve(path: Path) -> None:
 
 
 def write_card(path: Path, card: Card) -> None:
-    """Puts a card into an ONNX file's metadata, in the place of all that an exporter says of the machine it ran on."""
+    """Puts a card into an ONNX file's metadata, in the place of all that an exporter says of its machine."""
     import onnx
 
     model = onnx.load(str(path))

@@ -33,7 +33,10 @@ def test_weights_come_with_prim() -> None:
     for mapper in shipped:
         yolo, networks = load_set(SHIPPED / mapper, mapper)
         assert set(yolo.card.thresholds) == set(Kind)
-        assert all(weights.card.about["seed"] for weights in (yolo, *networks))
+        for weights in (yolo, *networks):
+            assert weights.card.about["seed"]
+            # nothing of the machine that made it
+            assert set(weights.session.get_modelmeta().custom_metadata_map) == {"prim"}
 
 
 @pytest.mark.parametrize("mapper", shipped)
