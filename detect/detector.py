@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import islice
@@ -17,6 +18,7 @@ from detect.weights import Weights, load_set
 from detect.yolo import KINDS, Boxes, Yolo, suppress
 from mapping.grid import GridFrame, OccupancyGrid
 from prim.errors import UsageError
+from prim.metrics import polygon_areas
 from prim.shapes import Kind, Primitive
 
 FLOOR = 0.05
@@ -169,13 +171,10 @@ def _suppressed(boxes: Boxes, among: NDArray[np.bool_], per_tile: Sequence[int])
 
 def _apart(measured: Sequence[Detection]) -> tuple[tuple[Detection, ...], list[Rejection]]:
     """Those, of detections best first, whose outlines keep clear of better ones: two things are not in one place."""
-    import shapely
-
-    outlines = [shapely.Polygon(one.primitive.outline(32)) for one in measured]
     stay: list[int] = []
     rejected = []
     for i, one in enumerate(measured):
-        shared = [outlines[i].intersection(outlines[k]).area / min(outlines[i].area, outlines[k].area) for k in stay]
+        shared = [_covered(one.primitive, measured[k].primitive) for k in stay]
         if max(shared, default=0.0) <= COVER_LIMIT:
             stay.append(i)
             continue
@@ -184,6 +183,14 @@ def _apart(measured: Sequence[Detection]) -> tuple[tuple[Detection, ...], list[R
         x0, y0, x1, y1 = one.box
         rejected.append(Rejection(one.primitive.kind, one.score, (x0 + x1) / 2, (y0 + y1) / 2, reason))
     return tuple(measured[i] for i in stay), rejected
+
+
+def _covered(a: Primitive, b: Primitive) -> float:
+    """How much two outlines share, of the smaller one's area."""
+    if math.hypot(a.x - b.x, a.y - b.y) > sum(max(one.width_height) for one in (a, b)):
+        return 0.0
+    first, second, shared = polygon_areas(a, b)
+    return shared / min(first, second)
 
 
 def _found(looked: _Looked, boxes: Boxes, i: int) -> Found:

@@ -18,6 +18,9 @@ BoolGrid = NDArray[np.bool_]
 FOUND_IOU = 0.5
 """A primitive counts as found when the kind agrees and the polygons' IoU is at least this."""
 
+OVERLAY_GRID = 1e-9
+"""Vertices are rounded to this (m) before polygons meet: without it, some that all but agree share nothing."""
+
 TOLERANCE_CELLS = 1
 """How far (cells, 8 neighbours) an occupied cell may lie from the truth's and still count."""
 
@@ -76,11 +79,17 @@ class MapScores:
 
 def polygon_iou(a: Primitive, b: Primitive) -> float:
     """Intersection over union of two outlines' polygons."""
+    first, second, shared = polygon_areas(a, b)
+    return shared / (first + second - shared)
+
+
+def polygon_areas(a: Primitive, b: Primitive) -> tuple[float, float, float]:
+    """The areas (m^2) of two outlines' polygons, and the area that they share."""
     import shapely  # when it is needed: a replay without detections starts faster
 
     first, second = shapely.Polygon(a.outline()), shapely.Polygon(b.outline())
-    shared: float = first.intersection(second).area
-    return shared / (float(first.area) + float(second.area) - shared)
+    shared = shapely.intersection(first, second, grid_size=OVERLAY_GRID)
+    return float(first.area), float(second.area), float(shared.area)
 
 
 def match_primitives(detections: Sequence[Primitive], truth: Sequence[Primitive]) -> list[Pair]:

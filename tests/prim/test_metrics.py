@@ -1,4 +1,5 @@
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -7,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from prim.metrics import detection_errors, dilate, map_scores, match_primitives, polygon_iou, pose_rmse
-from prim.shapes import Kind, Primitive
+from prim.shapes import SIZE_KEYS, Kind, Primitive
 
 
 def circle(x: float, radius: float = 0.1) -> Primitive:
@@ -21,6 +22,29 @@ def square(x: float, side: float, theta: float = 0.0) -> Primitive:
 def test_iou_of_shifted_squares() -> None:
     assert polygon_iou(square(0, 1), square(0.5, 1)) == pytest.approx(0.5 / 1.5)
     assert polygon_iou(square(0, 1), square(5, 1)) == 0
+
+
+@given(
+    kind=st.sampled_from(Kind),
+    theta=st.floats(0, 6.28),
+    sizes=st.tuples(st.floats(0.05, 0.3), st.floats(0.05, 0.3)),
+    moved=st.floats(-1e-8, 1e-8),
+)
+def test_what_all_but_agrees_overlaps_in_full(
+    kind: Kind, theta: float, sizes: tuple[float, float], moved: float
+) -> None:
+    shape = Primitive(
+        kind, 0.3, -0.2, None if kind is Kind.CIRCLE else theta, sizes[: len(SIZE_KEYS[kind])]
+    ).canonical()
+    assert polygon_iou(shape, replace(shape, x=shape.x + moved)) > 0.9999
+
+
+def test_triangles_that_differ_by_rounding_overlap_in_full() -> None:
+    shape = Primitive(Kind.TRIANGLE, 0.3, -0.2, 2.3597942834000514, (0.20226531937725828, 0.2021093395771307))
+    corners = shape.outline()[[2, 0, 1]]
+    base, up = corners[2] - corners[1], corners[0] - corners[1:].mean(axis=0)
+    again = replace(shape, theta=math.atan2(base[1], base[0]), size=(math.hypot(*base), math.hypot(*up)))
+    assert polygon_iou(again, shape) > 0.9999
 
 
 def test_perfect_detections() -> None:
