@@ -1,0 +1,311 @@
+"""The rays that pass a primitive, and what they say where they miss it: what refinement works on."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from detect.raycost import (
+    BOX,
+    DISC,
+    FAR,
+    MEASURED,
+    MISS,
+    NO_RETURN,
+    RANGE,
+    STOP,
+    TOO_NEAR,
+    TRIANGLE,
+    tables,
+    trace,
+    walk,
+)
+from mapping.grid import GridFrame, OccupancyGrid
+from prim.frames import Pose2D, Scan
+from prim.raycast import FloatArray
+from prim.shapes import Kind, Primitive
+
+MOST = 8000
+"""A primitive is fitted to about so many rays at most; of more, scans are left out evenly."""
+
+OUTLIERS = 0.005
+"""The share of ranges that have nothing to do with what stands there; spread evenly over all ranges."""
+
+DOUBT = 0.05
+"""The share of rays that what stands behind, as the map has it, does not explain."""
+
+NOTHING_BEYOND = 0.5
+"""The chance that a ray which leaves the map meets nothing at all."""
+
+LARGE = 0.75
+"""What hangs together over more than this (m) is no primitive."""
+
+TOUCHING = 0.008
+"""Cells of a wall whose centres lie within this (m) of a primitive are taken for the primitive's."""
+
+FAMILY = {
+    Kind.SQUARE: BOX,
+    Kind.RECTANGLE: BOX,
+    Kind.CIRCLE: DISC,
+    Kind.TRIANGLE: TRIANGLE,
+    Kind.ELLIPSE: DISC,
+}
+"""Which unit shape a kind is."""
+
+
+@dataclass(frozen=True)
+class Beams:
+    """Rays that pass one primitive: ``rays`` (N, 7) as detect.raycost has them, ``kinds`` (N,), from where on (m) they
+    are ``near`` it (N,), and each sensor's largest range ``far`` (N,).
+    """
+
+    rays: FloatArray
+    kinds: NDArray[np.int8]
+    near: FloatArray
+    far: FloatArray
+
+    def __len__(self) -> int:
+        return len(self.rays)
+
+    @classmethod
+    def joined(cls, parts: Sequence[Beams]) -> Beams:
+        """All parts, one after the other."""
+        if not parts:
+            return cls(np.zeros((0, 7)), np.zeros(0, np.int8), np.zeros(0), np.zeros(0))
+        return cls(*(np.concatenate([getattr(part, name) for part in parts]) for name in cls.__match_args__))
+
+    def of(self, chosen: NDArray[np.bool_]) -> Beams:
+        """Some of them."""
+        return Beams(self.rays[chosen], self.kinds[chosen], self.near[chosen], self.far[chosen])
+
+
+@dataclass(frozen=True)
+class Sensor:
+    """The sensor's noise ``std`` (m), its ``span`` of ranges (m), and the tables of likelihoods that follow."""
+
+    std: float
+    span: float
+    table: FloatArray
+
+    @classmethod
+    def of(cls, std: float, span: float) -> Sensor:
+        """The sensor with such noise and span."""
+        return cls(std, span, tables(OUTLIERS * _peak_share(std, span)))
+
+
+def _peak_share(std: float, span: float) -> float:
+    """What an even density over all ranges is in units of the noise's peak."""
+    return std * math.sqrt(2 * math.pi) / span
+
+
+def parameters(primitive: Primitive) -> FloatArray:
+    """A primitive as the kernels take it: x, y, theta, width, height."""
+    return np.array([primitive.x, primitive.y, primitive.theta or 0.0, *primitive.width_height])
+
+
+def circumradius(primitive: Primitive) -> float:
+    """How far (m) a primitive reaches from its centroid."""
+    return float(np.hypot(*primitive.local_outline(16).T).max())
+
+
+class Gatherer:
+    """Collects the rays that pass each of some circles: ``centres`` (M, 2) and ``reach`` (M,) in metres."""
+
+    def __init__(self, centres: FloatArray, reach: FloatArray) -> None:
+        self._centres, self._reach = centres, reach
+        self._kept: list[list[Beams]] = [[] for _ in reach]
+        self._size = [0] * len(reach)
+        self._stride = [1] * len(reach)
+        self._count = 0
+        self.span = 0.0
+
+    def add(self, scan: Scan, pose: Pose2D) -> None:
+        """Adds a scan, taken by a laser at ``pose``."""
+        self._count += 1
+        away = np.hypot(*(self._centres - (pose.x, pose.y)).T)
+        near = np.flatnonzero(away - self._reach < scan.range_max)
+        if not len(near):
+            return
+        self.span = max(self.span, scan.range_max - scan.range_min)
+        cos, sin = math.cos(pose.theta), math.sin(pose.theta)
+        directions = scan.directions @ np.array([[cos, sin], [-sin, cos]])
+        z = scan.ranges.astype(np.float64)
+        kinds = np.full(len(z), MEASURED, np.int8)
+        kinds[z >= scan.range_max] = NO_RETURN
+        kinds[z == -np.inf] = TOO_NEAR
+        says = (z >= max(scan.range_min, np.nextafter(0.0, 1.0))) | (kinds == TOO_NEAR)
+        z = np.where(kinds == MEASURED, z, np.where(kinds == TOO_NEAR, scan.range_min, scan.range_max))
+        for k in near.tolist():
+            if self._count % self._stride[k]:
+                continue
+            towards = self._centres[k] - (pose.x, pose.y)
+            aside = np.abs(directions[:, 0] * towards[1] - directions[:, 1] * towards[0])
+            passes = (aside < self._reach[k]) & (directions @ towards > -self._reach[k]) & says
+            chosen = np.flatnonzero(passes)
+            if len(chosen):
+                rays = np.zeros((len(chosen), 7))
+                rays[:, :2] = pose.x, pose.y
+                rays[:, 2:4] = directions[chosen]
+                rays[:, RANGE] = z[chosen]
+                near_from = directions[chosen] @ towards - self._reach[k]
+                self._keep(k, Beams(rays, kinds[chosen], near_from, np.full(len(chosen), scan.range_max)))
+
+    def _keep(self, k: int, beams: Beams) -> None:
+        """Keeps one scan's rays for a circle; leaves out every other scan where they become too many."""
+        self._kept[k].append(beams)
+        self._size[k] += len(beams)
+        if self._size[k] > 2 * MOST:
+            self._kept[k] = self._kept[k][::2]
+            self._size[k] = sum(len(one) for one in self._kept[k])
+            self._stride[k] *= 2
+
+    def beams(self) -> list[Beams]:
+        """Each circle's rays."""
+        return [Beams.joined(kept) for kept in self._kept]
+
+
+def gather(
+    scans: Iterable[tuple[Scan, Pose2D]], primitives: Sequence[Primitive], reach: float
+) -> tuple[list[Beams], float]:
+    """The rays that come within ``reach`` (m) of each primitive, and the largest span of ranges (m)."""
+    centres = np.array([(one.x, one.y) for one in primitives]).reshape(-1, 2)
+    gatherer = Gatherer(centres, np.array([circumradius(one) + reach for one in primitives]))
+    for scan, pose in scans:
+        gatherer.add(scan, pose)
+    return gatherer.beams(), gatherer.span
+
+
+@dataclass(frozen=True)
+class MapCells:
+    """A map's occupied cells (rows, cols), and which of them belong to something larger than any primitive."""
+
+    frame: GridFrame
+    occupied: NDArray[np.bool_]
+    large: NDArray[np.bool_]
+
+    @classmethod
+    def of(cls, grid: OccupancyGrid) -> MapCells:
+        """The cells of a map: what hangs together over more than LARGE is a wall, or the like."""
+        from scipy import ndimage  # when it is needed: a replay without refinement starts faster
+
+        labels, _ = ndimage.label(grid.occupied, np.ones((3, 3)))
+        cells = LARGE / grid.frame.resolution
+        large = [
+            number
+            for number, (rows, cols) in enumerate(ndimage.find_objects(labels), start=1)
+            if max(rows.stop - rows.start, cols.stop - cols.start) > cells
+        ]
+        return cls(grid.frame, grid.occupied, np.isin(labels, large))
+
+    def without(self, primitives: Sequence[Primitive], margin: float) -> NDArray[np.bool_]:
+        """The occupied cells (rows, cols) without those of the primitives, and what lies within ``margin`` (m) of them.
+
+        Walls stay, but for what lies in a primitive or all but touches it.
+        """
+        occupied = self.occupied.copy()
+        for primitive in primitives:
+            rows, cols, points = _cells_around(self.frame, primitive, circumradius(primitive) + margin)
+            near, touching = (is_within(primitive, points, reach) for reach in (margin, min(margin, TOUCHING)))
+            occupied[rows, cols] &= ~np.where(self.large[rows, cols], touching, near)
+        return occupied
+
+
+def _cells_around(frame: GridFrame, primitive: Primitive, reach: float) -> tuple[slice, slice, FloatArray]:
+    """The part of a grid around a primitive: its rows and columns, and its cells' centres (rows, cols, 2)."""
+
+    def span(middle: float, first: int, count: int) -> tuple[int, int]:
+        low = math.floor((middle - reach) / frame.resolution) - first
+        high = math.ceil((middle + reach) / frame.resolution) - first
+        return min(max(low, 0), count), min(max(high, 0), count)
+
+    row, last_row = span(primitive.y, frame.row, frame.rows)
+    col, last_col = span(primitive.x, frame.col, frame.cols)
+    x = (np.arange(col, last_col) + frame.col + 0.5) * frame.resolution
+    y = (np.arange(row, last_row) + frame.row + 0.5) * frame.resolution
+    return slice(row, last_row), slice(col, last_col), np.stack(np.meshgrid(x, y), axis=-1)
+
+
+def is_within(primitive: Primitive, points: FloatArray, margin: float) -> NDArray[np.bool_]:
+    """Which points (..., 2) lie in a primitive or no more than ``margin`` (m) outside of it (corners cut square)."""
+    cos, sin = math.cos(primitive.theta or 0.0), math.sin(primitive.theta or 0.0)
+    local = (points - (primitive.x, primitive.y)) @ np.array([[cos, -sin], [sin, cos]])
+    if primitive.is_round:
+        semi = np.array(primitive.width_height) + margin
+        return np.asarray(((local / semi) ** 2).sum(axis=-1) < 1)
+    corners = primitive.local_outline()
+    along = np.roll(corners, -1, axis=0) - corners
+    normals = np.column_stack((along[:, 1], -along[:, 0])) / np.hypot(*along.T)[:, None]
+    reaches = (normals * corners).sum(axis=1) + margin
+    return np.asarray((local @ normals.T < reaches).all(axis=-1))
+
+
+@dataclass(frozen=True)
+class Backdrop:
+    """Where (m) beams end in the map behind a primitive, which of them leave the map instead, and which end before
+    they come near the primitive; a stop is known to within ``spread`` (m).
+    """
+
+    stops: FloatArray
+    ends: NDArray[np.bool_]
+    blocked: NDArray[np.bool_]
+    spread: float
+
+
+def backdrop(beams: Beams, occupied: NDArray[np.bool_], frame: GridFrame) -> Backdrop:
+    """What stands behind a primitive whose cells are cleared; a cell tells it to within a cell."""
+    stops, ends = np.zeros(len(beams)), np.zeros(len(beams), np.bool_)
+    walk(occupied, frame.row, frame.col, 1 / frame.resolution, beams.rays, beams.far, stops, ends)
+    return Backdrop(stops, ends, ends & (stops < beams.near), 0.5 * frame.resolution)
+
+
+def behind(beams: Beams, map_behind: Backdrop, others: Sequence[Primitive], sensor: Sensor) -> Beams:
+    """The beams with what they say where they miss a primitive: STOP and MISS, from the map and other primitives."""
+    rays = beams.rays.copy()
+    stops, ends = map_behind.stops, map_behind.ends
+    miss = np.log(explained(beams, stops, ends, map_behind.spread, sensor))
+    nearest = np.full(len(beams), FAR)
+    for other in others:
+        distance = np.empty(len(beams))
+        trace(FAMILY[other.kind], parameters(other), beams.rays, distance)
+        np.minimum(nearest, distance, out=nearest)
+    first = nearest < stops
+    rays[:, STOP] = np.where(map_behind.blocked, 0.0, nearest)
+    rays[:, MISS] = np.where(first, log_likelihood(beams, np.where(first, nearest, 1.0), sensor), miss)
+    return replace(beams, rays=rays)
+
+
+def log_likelihood(beams: Beams, distance: FloatArray, sensor: Sensor) -> FloatArray:
+    """The logarithm of the likelihood (N,) of what beams measured where they end at ``distance`` (N,)."""
+    x = (distance - beams.rays[:, RANGE]) / sensor.std
+    return in_table(sensor.table, beams.kinds, x)
+
+
+def in_table(table: FloatArray, kinds: NDArray[np.int8], x: FloatArray) -> FloatArray:
+    """Log-likelihoods (N,) at x (N,), to the nearest entry of the table."""
+    reach = (table.shape[1] - 1) / 2
+    place = np.clip(np.rint(x * 64 + reach), 0, 2 * reach).astype(np.intp)
+    return np.asarray(table[kinds, place])
+
+
+def explained(beams: Beams, stops: FloatArray, ends: NDArray[np.bool_], spread: float, sensor: Sensor) -> FloatArray:
+    """The likelihood (N,) of what beams measured where they end in the map at ``stops``, or leave it there.
+
+    A stop is known to within ``spread`` (m). A ray that leaves the map ends anywhere beyond, or nowhere.
+    """
+    z, kinds = beams.rays[:, RANGE], beams.kinds
+    even = _peak_share(sensor.std, sensor.span)
+    wide = math.hypot(sensor.std, spread)
+    at_stop = np.exp(in_table(sensor.table, kinds, (stops - z) / wide))
+    at_stop *= np.where(kinds == MEASURED, sensor.std / wide, 1.0)
+    beyond = np.exp(in_table(sensor.table, np.full(len(z), NO_RETURN, np.int8), (z - stops) / sensor.std))
+    left = np.where(
+        kinds == MEASURED,
+        (1 - NOTHING_BEYOND) * beyond * _peak_share(sensor.std, 1.0) / np.maximum(beams.far - stops, sensor.std),
+        np.where(kinds == NO_RETURN, NOTHING_BEYOND, OUTLIERS),
+    )
+    unsure = np.where(kinds == MEASURED, even, 0.1)
+    return np.asarray((1 - DOUBT) * np.where(ends, at_stop, left) + DOUBT * unsure)
