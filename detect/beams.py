@@ -59,14 +59,15 @@ FAMILY = {
 
 @dataclass(frozen=True)
 class Beams:
-    """Rays that pass one primitive: ``rays`` (N, 7) as detect.raycost has them, ``kinds`` (N,), from where on (m) they
-    are ``near`` it (N,), and each sensor's largest range ``far`` (N,).
+    """Rays that pass one primitive: ``rays`` (N, 7) as detect.raycost has them, ``kinds`` (N,), from where on (m)
+    they are ``near`` it (N,), each sensor's largest range ``far`` (N,), and the number of the ``scan`` (N,).
     """
 
     rays: FloatArray
     kinds: NDArray[np.int8]
     near: FloatArray
     far: FloatArray
+    scan: NDArray[np.int32]
 
     def __len__(self) -> int:
         return len(self.rays)
@@ -75,26 +76,33 @@ class Beams:
     def joined(cls, parts: Sequence[Beams]) -> Beams:
         """All parts, one after the other."""
         if not parts:
-            return cls(np.zeros((0, 7)), np.zeros(0, np.int8), np.zeros(0), np.zeros(0))
+            return cls(np.zeros((0, 7)), np.zeros(0, np.int8), np.zeros(0), np.zeros(0), np.zeros(0, np.int32))
         return cls(*(np.concatenate([getattr(part, name) for part in parts]) for name in cls.__match_args__))
 
     def of(self, chosen: NDArray[np.bool_]) -> Beams:
         """Some of them."""
-        return Beams(self.rays[chosen], self.kinds[chosen], self.near[chosen], self.far[chosen])
+        return Beams(*(getattr(self, name)[chosen] for name in self.__match_args__))
 
 
 @dataclass(frozen=True)
 class Sensor:
-    """The sensor's noise ``std`` (m), its ``span`` of ranges (m), and the tables of likelihoods that follow."""
+    """The sensor's noise ``std`` (m), its ``span`` of ranges (m), and the tables of likelihoods that follow.
+
+    ``footprint`` (m): half the width over which a beam that passes an edge may meet it or not: the beam's own width,
+    and how far poses and bearings are off. ``dispersion``: how much larger the squared errors of whole scans are than
+    those of single rays would make them; 1 where poses are exact.
+    """
 
     std: float
     span: float
     table: FloatArray
+    footprint: float = 0.0
+    dispersion: float = 1.0
 
     @classmethod
-    def of(cls, std: float, span: float) -> Sensor:
+    def of(cls, std: float, span: float, footprint: float = 0.0, dispersion: float = 1.0) -> Sensor:
         """The sensor with such noise and span."""
-        return cls(std, span, tables(OUTLIERS * _peak_share(std, span)))
+        return cls(std, span, tables(OUTLIERS * _peak_share(std, span)), footprint, dispersion)
 
 
 def _peak_share(std: float, span: float) -> float:
@@ -152,7 +160,9 @@ class Gatherer:
                 rays[:, 2:4] = directions[chosen]
                 rays[:, RANGE] = z[chosen]
                 near_from = directions[chosen] @ towards - self._reach[k]
-                self._keep(k, Beams(rays, kinds[chosen], near_from, np.full(len(chosen), scan.range_max)))
+                far = np.full(len(chosen), scan.range_max)
+                number = np.full(len(chosen), self._count, np.int32)
+                self._keep(k, Beams(rays, kinds[chosen], near_from, far, number))
 
     def _keep(self, k: int, beams: Beams) -> None:
         """Keeps one scan's rays for a circle; leaves out every other scan where they become too many."""
@@ -181,10 +191,13 @@ def gather(
 
 @dataclass(frozen=True)
 class MapCells:
-    """A map's occupied cells (rows, cols), and which of them belong to something larger than any primitive."""
+    """A map's occupied cells (rows, cols), numbered by what hangs together (0: not occupied), and which of them
+    belong to something larger than any primitive.
+    """
 
     frame: GridFrame
     occupied: NDArray[np.bool_]
+    labels: NDArray[np.int32]
     large: NDArray[np.bool_]
 
     @classmethod
@@ -199,10 +212,10 @@ class MapCells:
             for number, (rows, cols) in enumerate(ndimage.find_objects(labels), start=1)
             if max(rows.stop - rows.start, cols.stop - cols.start) > cells
         ]
-        return cls(grid.frame, grid.occupied, np.isin(labels, large))
+        return cls(grid.frame, grid.occupied, labels, np.isin(labels, large))
 
     def without(self, primitives: Sequence[Primitive], margin: float) -> NDArray[np.bool_]:
-        """The occupied cells (rows, cols) without those of the primitives, and what lies within ``margin`` (m) of them.
+        """The occupied cells (rows, cols) but for those of the primitives and within ``margin`` (m) of them.
 
         Walls stay, but for what lies in a primitive or all but touches it.
         """

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
@@ -44,12 +44,18 @@ BATCH = 8
 class Detection:
     """A primitive with its ``score`` (0 to 1), YOLO's ``box`` (m: x0, y0, x1, y1), and the ``crop`` (pixels, pixels)
     that its parameters were read from.
+
+    Where it was refined by rays (detect.refine), ``std`` (m, rad) tells by name how sure its parameters are, and
+    ``chances`` of what kind it is: the score is then its kind's, the box its outline's, and the crop is empty where
+    the networks had not found it.
     """
 
     primitive: Primitive
     score: float
     box: tuple[float, float, float, float]
     crop: NDArray[np.uint8]
+    std: Mapping[str, float] | None = None
+    chances: Mapping[Kind, float] | None = None
 
 
 @dataclass(frozen=True)

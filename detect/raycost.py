@@ -5,8 +5,8 @@ unit shape's own frame tells the distance to all of them, and its derivatives. W
 meets it (r) and by how much it hits or misses it (s, the distance of the ray's line from the nearer silhouette).
 
 A ray that hits has the likelihood of its range at r, one that misses that of what stands behind. Between the two the
-likelihood jumps; a footprint of half-width ``blur`` (m) blends them over -blur < s < blur, so that there is a slope to
-descend: it shrinks as the fit comes near. With ``blur`` 0 the likelihood is exact.
+likelihood jumps; a footprint of half-width ``blur`` (m) blends them over -blur < s < blur, so that there is a slope
+to descend: it shrinks as the fit comes near. With ``blur`` 0 the likelihood is exact.
 
 Parameters are always five: x, y, theta, width, height; a square's and a circle's two sizes are tied by the matrix
 that maps a kind's own parameters to these. Compiled code is cached beside this file and made anew when this file
@@ -31,8 +31,8 @@ X, Y, THETA, WIDTH, HEIGHT = range(5)
 PARAMETERS = 5
 
 ORIGIN_X, ORIGIN_Y, DIRECTION_X, DIRECTION_Y, RANGE, STOP, MISS = range(7)
-"""Columns of beams (N, 7): the ray; the measured range, or the limit it is beyond; where the ray ends if it misses the
-shape (m); the logarithm of its likelihood then."""
+"""Columns of beams (N, 7): the ray; the measured range, or the limit it is beyond; from where on (m) something else
+stops it; the logarithm of its likelihood if it misses the shape."""
 
 MEASURED, TOO_NEAR, NO_RETURN = 0, 1, 2
 
@@ -53,9 +53,15 @@ FAR, BEHIND = 1e30, 1e31
 
 @lru_cache(maxsize=1)
 def _normal() -> tuple[NDArray[np.float64], ...]:
-    """x as the tables have it, exp(-x²/2), and Phi(-x)."""
+    """X as the tables have it, exp(-x²/2), and Phi(-x)."""
     x = np.arange(-TABLE_REACH * TABLE_SPACING, TABLE_REACH * TABLE_SPACING + 1) / TABLE_SPACING
     return x, np.exp(-(x**2) / 2), np.array([0.5 * math.erfc(value / math.sqrt(2)) for value in x])
+
+
+def not_below(cut: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The chance (N,) that a standard normal number is not below each ``cut``."""
+    x, _, above = _normal()
+    return np.interp(cut, x, above)
 
 
 def tables(outlier: float) -> NDArray[np.float64]:
@@ -76,8 +82,17 @@ def looked_up(table: Any, row: int, x: float) -> float:
     """A row of the table at x, linear between its entries."""
     place = (min(max(x, -TABLE_REACH), TABLE_REACH) + TABLE_REACH) * TABLE_SPACING
     entry = min(int(place), 2 * int(TABLE_REACH) * TABLE_SPACING - 1)
-    low = table[row, entry]
-    return low + (place - entry) * (table[row, entry + 1] - low)
+    low = float(table[row, entry])
+    return low + (place - entry) * (float(table[row, entry + 1]) - low)
+
+
+@inline
+def edge_of(family: int, edge: int) -> tuple[float, float, float]:
+    """One edge of the unit box or triangle: its outward normal, and its distance from the centroid."""
+    if family == TRIANGLE:
+        return EDGE_X[edge], EDGE_Y[edge], EDGE_AT[edge]
+    side = 1.0 if edge % 2 == 0 else -1.0
+    return (side, 0.0, 0.5) if edge < 2 else (0.0, side, 0.5)
 
 
 @inline
@@ -99,12 +114,7 @@ def entry(family: int, lx: float, ly: float, ux: float, uy: float) -> tuple[floa
         return t, lx + t * ux, ly + t * uy
     leave = FAR
     for edge in range(4 if family == BOX else 3):
-        if family == BOX:
-            ex = 0.0 if edge >= 2 else (1.0 if edge == 0 else -1.0)
-            ey = 0.0 if edge < 2 else (1.0 if edge == 2 else -1.0)
-            at = 0.5
-        else:
-            ex, ey, at = EDGE_X[edge], EDGE_Y[edge], EDGE_AT[edge]
+        ex, ey, at = edge_of(family, edge)
         towards = ex * ux + ey * uy
         gap = at - ex * lx - ey * ly
         if towards == 0.0:
@@ -211,10 +221,11 @@ def trace(family: int, p: Any, beams: Any, out: Any) -> None:
 
 
 @kernel
-def margins(family: int, p: Any, covariance: Any, beams: Any, out: Any) -> None:
+def margins(family: int, p: Any, covariance: Any, beams: Any, blur: float, out: Any) -> None:
     """By how many standard deviations (N,) beams hit a shape whose parameters have a ``covariance`` (5, 5).
 
-    Below 0 for a miss; a beam that something else stops before it comes to the shape misses it for certain.
+    Below 0 for a miss, 0 where its footprint of half-width ``blur`` (m) meets an edge. A beam that something else
+    stops before it comes to the shape misses it for certain.
     """
     cos, sin = math.cos(p[THETA]), math.sin(p[THETA])
     dr, ds = np.zeros(PARAMETERS), np.zeros(PARAMETERS)
@@ -227,7 +238,8 @@ def margins(family: int, p: Any, covariance: Any, beams: Any, out: Any) -> None:
         for a in range(PARAMETERS):
             for b in range(PARAMETERS):
                 variance += ds[a] * covariance[a, b] * ds[b]
-        out[i] = s / math.sqrt(variance)
+        clear = s - blur if s > blur else (s + blur if s < -blur else 0.0)
+        out[i] = clear / math.sqrt(variance)
 
 
 @kernel
@@ -264,7 +276,7 @@ def slopes(
     gradient: Any,
     information: Any,
 ) -> float:
-    """The negative log-likelihood of every ``step``-th beam, times ``step``, its gradient (5,) and information (5, 5).
+    """The negative log-likelihood of every ``step``-th beam, times ``step``; its gradient (5,), information (5, 5).
 
     Information is Gauss and Newton's for rays that hit, and the squared score for what silhouettes say.
     """
@@ -340,6 +352,32 @@ def solve(matrix: Any, vector: Any, damping: float, out: Any, lower: Any, size: 
     return True
 
 
+@inline
+def project(tie: Any, gradient: Any, full: Any, downhill: Any, information: Any) -> None:
+    """A kind's own downhill direction (K,) and information (K, K), of those of the five parameters."""
+    size = tie.shape[1]
+    for k in range(size):
+        downhill[k] = 0.0
+        for a in range(PARAMETERS):
+            downhill[k] -= tie[a, k] * gradient[a]
+        for m in range(size):
+            information[k, m] = 0.0
+            for a in range(PARAMETERS):
+                for b in range(PARAMETERS):
+                    information[k, m] += tie[a, k] * full[a, b] * tie[b, m]
+
+
+@inline
+def step_to(p: Any, tie: Any, change: Any, trial: Any) -> None:
+    """Where a change (K,) of a kind's own parameters leads; a size is no more than halved or doubled."""
+    for a in range(PARAMETERS):
+        trial[a] = p[a]
+        for k in range(tie.shape[1]):
+            trial[a] += tie[a, k] * change[k]
+    for a in (WIDTH, HEIGHT):
+        trial[a] = min(max(trial[a], 0.5 * p[a], SMALLEST), 2 * p[a], LARGEST)
+
+
 @kernel
 def descend(
     family: int,
@@ -370,24 +408,11 @@ def descend(
         cost = slopes(family, p, beams, kinds, step, sigma, table, blur, gradient, full)
         damping = 1e-2
         for _ in range(iterations):
-            for k in range(size):
-                downhill[k] = 0.0
-                for a in range(PARAMETERS):
-                    downhill[k] -= tie[a, k] * gradient[a]
-                for m in range(size):
-                    information[k, m] = 0.0
-                    for a in range(PARAMETERS):
-                        for b in range(PARAMETERS):
-                            information[k, m] += tie[a, k] * full[a, b] * tie[b, m]
+            project(tie, gradient, full, downhill, information)
             if not solve(information, downhill, damping, change, lower, size):
                 damping = max(10 * damping, 1e-3)
                 continue
-            for a in range(PARAMETERS):
-                trial[a] = p[a]
-                for k in range(size):
-                    trial[a] += tie[a, k] * change[k]
-            trial[WIDTH] = min(max(trial[WIDTH], 0.5 * p[WIDTH], SMALLEST), 2 * p[WIDTH], LARGEST)
-            trial[HEIGHT] = min(max(trial[HEIGHT], 0.5 * p[HEIGHT], SMALLEST), 2 * p[HEIGHT], LARGEST)
+            step_to(p, tie, change, trial)
             found = slopes(family, trial, beams, kinds, step, sigma, table, blur, other_gradient, other_full)
             if found < cost:
                 gained = cost - found
@@ -402,12 +427,7 @@ def descend(
                 damping *= 8
                 if damping > 1e4:
                     break
-    for k in range(size):
-        for m in range(size):
-            information[k, m] = 0.0
-            for a in range(PARAMETERS):
-                for b in range(PARAMETERS):
-                    information[k, m] += tie[a, k] * full[a, b] * tie[b, m]
+    project(tie, gradient, full, downhill, information)
     return cost
 
 

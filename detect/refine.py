@@ -2,14 +2,16 @@
 
 For every candidate (what the networks found, and things in the map that they missed):
 
-1. the rays that pass it are gathered, and what stands behind it is read from the map and from the other candidates;
-2. every kind is fitted, from several starts (turned, mirrored), coarsely to few rays and then to all of them;
-3. kinds are weighed by their evidence, the likelihood averaged over all parameters (importance sampling): a square
-   that explains the rays as well as a rectangle does is the likelier one, since it has one size less to choose;
-4. the same samples give the mean and the covariance of the parameters.
+1. the rays that pass it are gathered, and what stands behind it is read from the map and from the other candidates
+   (detect.beams);
+2. every kind is fitted, from several starts (turned, mirrored), coarsely to few rays and then to all of them
+   (detect.fit);
+3. kinds are weighed by their evidence, the likelihood averaged over all parameters: a square that explains the rays
+   as well as a rectangle does is the likelier one, since it has one size less to choose; the same samples give the
+   mean and the covariance of the parameters (detect.evidence).
 
-Candidates see each other's shadows: all are fitted once, those that the rays contradict or that are found twice go,
-and what is left is fitted again beside the others. The noise is found from the rays on the way.
+Candidates see each other's shadows: all are fitted once, those that are found twice go, and what is left is fitted
+again beside the others. The noise is found from the rays on the way. What the rays contradict is no detection.
 """
 
 from __future__ import annotations
@@ -17,8 +19,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import Executor, ThreadPoolExecutor
-from dataclasses import dataclass, field
-from functools import lru_cache
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -37,54 +38,22 @@ from detect.beams import (
     in_table,
     parameters,
 )
-from detect.raycost import MEASURED, MISS, PARAMETERS, RANGE, STOP, costs, descend, margins, slopes, trace
+from detect.detector import Detection, Detections, Rejection
+from detect.evidence import exact_costs, laplace, weighed
+from detect.fit import Fit, again, primitive_of, search
+from detect.proposals import proposals
+from detect.raycost import MEASURED, MISS, RANGE, STOP, not_below, trace
 from mapping.grid import OccupancyGrid
 from prim.frames import Pose2D, Scan
 from prim.metrics import polygon_areas
 from prim.raycast import FloatArray
-from prim.shapes import SIZE_KEYS, Kind, Primitive
+from prim.shapes import Kind, Primitive
 
 REACH = 0.07
 """Rays that come within this (m) of a candidate are looked at."""
 
-COARSE_RAYS = 800
-COARSE_BLURS = np.array([0.03, 0.012])
-FINE_BLURS = np.array([0.008, 0.003, 0.001])
-COARSE_STEPS, FINE_STEPS = 10, 12
-TOLERANCE = 0.02
-"""A fit ends where a step gains less than this (nats)."""
-
-HOPELESS = 60.0
-"""A kind whose coarse fit is this much (nats) less likely than the best one's is not fitted to all rays."""
-
-WAYS = 2
-"""So many of a kind's coarse fits are gone on with."""
-
-ALIKE = 1.3
-"""A triangle whose sides are no more unlike than this may have been fitted with the wrong apex."""
-
-SIMPLER = {Kind.RECTANGLE: Kind.SQUARE, Kind.ELLIPSE: Kind.CIRCLE}
-"""Kinds that are special cases of others, and fitted wherever these are."""
-
 ROUNDS = 2
 """So often all candidates are fitted beside each other, once they are told apart."""
-
-CONTENDER = 7.0
-"""Kinds whose evidence is within this (nats) of the best one's are sampled."""
-
-LONGEST = 0.7
-"""Sizes are taken to be even up to this (m), before the rays are asked."""
-
-SAMPLES = (300, 300, 600)
-DEGREES = 6.0
-"""So many samples are drawn in each round, from Student's t with so many degrees of freedom: its tails are heavy."""
-
-EFFECTIVE = 0.15
-"""In all rounds but the last, weights are made more alike until this share of the samples counts."""
-
-LEAST_STD = (1e-4, 1e-4, 1e-3, 1e-4, 1e-4)
-MOST_TURN = 0.5
-"""Bounds on what samples are spread over (m, rad)."""
 
 LEAST_NOISE = 0.002
 """Noise (m) below this is not told apart: poses and ranges as logs hold them are no better."""
@@ -92,33 +61,41 @@ LEAST_NOISE = 0.002
 LEAST_GAIN = 25.0
 """A primitive makes the rays more likely than an empty place does by at least so much (nats)."""
 
-WORST_MISFIT = 0.35
+MOST_MISFIT = 0.25
 """Of the rays that meet a primitive, the map explains each better by no more than this (nats) on average."""
+
+LEAST_SEEN = 0.55
+"""What the networks did not find must be seen from so many sides: this share of its outline's directions."""
+
+LEAST_SURE = 0.5
+"""And its kind must be at least as sure as this."""
+
+SECTORS = 24
+"""Directions around a primitive's centroid, in which its outline is seen or not."""
 
 SAME = 0.25
 """Two candidates that share more than this (of the smaller one's area) are one."""
 
 CLEARED_FIRST, CLEARED = 0.03, 0.02
-"""So far (m) around a candidate the map's cells are its own and not what stands behind: first, and when it is fitted."""
+"""So far (m) around a candidate the map's cells are its own, not what stands behind: at first, and once fitted."""
 
 MOVED, MOVED_SHARE = 0.05, 0.005
 """What stands behind has changed where more than such a share of rays ends elsewhere (m): all is fitted anew."""
 
 FEW = 20
-"""Fewer rays than this do not tell the noise."""
+"""Fewer rays than this do not tell the noise, and fewer scans no dispersion."""
+
+FEW_OF_SCAN = 4
+"""Fewer rays of one scan than this do not tell how far it is off as a whole."""
+
+CLEAR_ERROR = 4.0
+"""A ray that is off by more standard deviations than this met something else."""
+
+FOOTPRINTS = (0.0, 0.0005, 0.001, 0.002, 0.004, 0.008, 0.016)
+"""Footprints (m) that are tried; the first two are taken for none."""
 
 START_NOISE = 0.03
 """The noise (m) where nothing tells it."""
-
-
-@dataclass(frozen=True)
-class Fit:
-    """A kind fitted to rays: the five parameters, the cost (nats), and the information on its own parameters."""
-
-    kind: Kind
-    p: FloatArray
-    cost: float
-    information: FloatArray
 
 
 @dataclass(frozen=True)
@@ -127,7 +104,7 @@ class Refined:
 
     ``std`` (m, rad) by name: x, y, theta and the sizes; ``covariance`` in the same order; ``chances`` of the kinds;
     ``gain``: by how much (nats) the rays are likelier than without it; ``misfit``: by how much (nats a ray) the map
-    explains those that meet it better; ``rays``: how many do.
+    explains those that meet it better; ``rays``: how many do; ``seen``: the share of its outline that they meet.
     """
 
     primitive: Primitive
@@ -137,6 +114,7 @@ class Refined:
     gain: float
     misfit: float
     rays: int
+    seen: float
 
     @property
     def score(self) -> float:
@@ -159,39 +137,103 @@ class Candidate:
         return primitive_of(self.fits[0].kind, self.fits[0].p) if self.fits else self.start
 
 
-def refine(
-    primitives: Sequence[Primitive],
+def refine_detections(
+    detections: Detections,
     scans: Iterable[tuple[Scan, Pose2D]],
     grid: OccupancyGrid,
     noise_std: float | None = None,
     threads: int = 2,
-) -> tuple[list[Refined | None], float]:
-    """Fits primitives (as the networks found them in ``grid``) to the rays of the scans that the grid was made of.
+) -> tuple[Detections, float | None]:
+    """Detections in ``grid`` refined by the scans that it was made of, and what was missed in it beside them.
+
+    ``noise_std`` (m) is the range noise, where it is known. Returns what the rays support, likeliest first, what they
+    do not with the reasons, and the noise; None where no ray passes anything.
+    """
+    cells = MapCells.of(grid)
+    guesses = [one.primitive for one in detections.found]
+    added = proposals(cells, guesses)
+    refined, found_std = refine([*guesses, *added], scans, cells, noise_std, threads)
+    kept: list[Detection] = []
+    rejected = list(detections.rejected)
+    for guess, made in zip(detections.found, refined, strict=False):
+        reason = contradiction(made)
+        if made is None or reason:
+            rejected.append(_rejected(guess.primitive, guess.score, reason))
+        else:
+            kept.append(_detection(made, guess.crop))
+    for start, made in zip(added, refined[len(guesses) :], strict=True):
+        reason = contradiction(made) or (doubt(made) if made is not None else "")
+        if made is None or reason:
+            rejected.append(_rejected(start, made.score if made else 0.0, f"not found by the networks; {reason}"))
+        else:
+            kept.append(_detection(made, np.zeros((0, 0), np.uint8)))
+    kept.sort(key=lambda one: -one.score)
+    rejected.sort(key=lambda one: -one.score)
+    return Detections(tuple(kept), tuple(rejected)), found_std
+
+
+def contradiction(made: Refined | None) -> str:
+    """Why the rays speak against a primitive; nothing where they do not."""
+    if made is None:
+        return "no ray passes it, or a likelier one stands in its place"
+    if made.gain < LEAST_GAIN:
+        return f"the rays are likelier with it by {made.gain:.0f} nats only, less than {LEAST_GAIN:g}"
+    if made.misfit > MOST_MISFIT:
+        return f"its rays are likelier by {made.misfit:.2f} nats each in the map alone, more than {MOST_MISFIT:g}"
+    return ""
+
+
+def doubt(made: Refined) -> str:
+    """Why something that the networks did not find is not taken for a primitive; nothing where it is."""
+    if made.seen < LEAST_SEEN:
+        return f"only {made.seen:.0%} of its outline is seen, less than {LEAST_SEEN:.0%}"
+    if made.score < LEAST_SURE:
+        return f"its kind is sure by {made.score:.2f} only, less than {LEAST_SURE:g}"
+    return ""
+
+
+def _rejected(primitive: Primitive, score: float, reason: str) -> Rejection:
+    return Rejection(primitive.kind, score, primitive.x, primitive.y, reason)
+
+
+def _detection(made: Refined, crop: NDArray[np.uint8]) -> Detection:
+    outline = made.primitive.outline()
+    (x0, y0), (x1, y1) = outline.min(axis=0).tolist(), outline.max(axis=0).tolist()
+    return Detection(made.primitive, made.score, (x0, y0, x1, y1), crop, made.std, made.chances)
+
+
+def refine(
+    primitives: Sequence[Primitive],
+    scans: Iterable[tuple[Scan, Pose2D]],
+    cells: MapCells,
+    noise_std: float | None = None,
+    threads: int = 2,
+) -> tuple[list[Refined | None], float | None]:
+    """Fits primitives to the rays of the scans that a map was made of.
 
     Returns, in the order given, each one refined, or None for one that no ray passes or that another one stands for
     as well; and the noise (m), found from the rays where it is not given.
     """
+    if not primitives:
+        return [], noise_std
     around, span = gather(scans, primitives, REACH)
     candidates = [Candidate(start, beams) for start, beams in zip(primitives, around, strict=True)]
     seen = [one for one in candidates if len(one.beams)]
     if not seen:
-        return [None] * len(primitives), noise_std or START_NOISE
+        return [None] * len(primitives), noise_std
     sensor = Sensor.of(noise_std or first_noise(seen), span)
     with ThreadPoolExecutor(threads) as pool:
-        cells = MapCells.of(grid)
         look_behind(seen, cells, CLEARED_FIRST)
         fit_all(pool, seen, [True] * len(seen), sensor)
         alone = _once(seen, sensor)
-        if noise_std is None:
-            sensor = Sensor.of(measured_noise(alone, sensor), span)
+        sensor = measured(alone, sensor, noise_std)
         for _ in range(ROUNDS):
             changed = look_behind(alone, cells, CLEARED)
             fit_all(pool, alone, changed, sensor)
-        if noise_std is None:
-            sensor = Sensor.of(measured_noise(alone, sensor), span)
+            sensor = measured(alone, sensor, noise_std)
         beams = [before_others(one, alone, sensor) for one in alone]
-        whole = [backdrop(one.beams, grid.occupied, grid.frame) for one in alone]
-        refined = list(pool.map(lambda *of: finish(*of, sensor), alone, beams, whole))
+        whole = [backdrop(one.beams, cells.occupied, cells.frame) for one in alone]
+        refined = list(pool.map(lambda one, own, alone: finish(one, own, alone, sensor), alone, beams, whole))
     made = {id(one): result for one, result in zip(alone, refined, strict=True)}
     return [made.get(id(one)) for one in candidates], sensor.std
 
@@ -199,9 +241,15 @@ def refine(
 def fit_all(pool: Executor, candidates: Sequence[Candidate], anew: Sequence[bool], sensor: Sensor) -> None:
     """Fits all candidates beside what was known of the others before: ``anew``, or from where they are."""
     beams = [before_others(one, candidates, sensor) for one in candidates]
-    fits = pool.map(lambda one, own, new: (search if new else again)(one, own, sensor), candidates, beams, anew)
+    fits = pool.map(lambda one, own, new: _fitted(one, own, sensor, new), candidates, beams, anew)
     for one, found in zip(candidates, list(fits), strict=True):
         one.fits = found
+
+
+def _fitted(candidate: Candidate, beams: Beams, sensor: Sensor, anew: bool) -> list[Fit]:
+    """A candidate's kinds, likeliest first, as far as a Gaussian tells their evidence."""
+    fits = search(candidate.now, beams, sensor) if anew else again(candidate.fits, beams, sensor)
+    return sorted(fits, key=lambda fit: -laplace(fit))
 
 
 def look_behind(candidates: Sequence[Candidate], cells: MapCells, margin: float) -> list[bool]:
@@ -229,10 +277,57 @@ def first_noise(candidates: Sequence[Candidate]) -> float:
 
 def _residuals(beams: Beams, primitive: Primitive) -> FloatArray:
     """How far (m) measured ranges are from a primitive that their rays meet."""
-    distance = np.empty(len(beams))
-    trace(FAMILY[primitive.kind], parameters(primitive), beams.rays, distance)
+    distance = _distance(primitive, beams)
     hit = (distance < beams.far) & (beams.kinds == MEASURED)
     return np.asarray(beams.rays[hit, RANGE] - distance[hit])
+
+
+def measured(candidates: Sequence[Candidate], sensor: Sensor, noise_std: float | None) -> Sensor:
+    """What the candidates' rays tell of the sensor: its noise where it is not given, footprint and dispersion."""
+    std = noise_std or measured_noise(candidates, sensor)
+    sensor = Sensor.of(std, sensor.span, sensor.footprint)
+    footprint = measured_footprint(candidates, sensor)
+    return Sensor.of(std, sensor.span, footprint, measured_dispersion(candidates, sensor))
+
+
+def measured_footprint(candidates: Sequence[Candidate], sensor: Sensor) -> float:
+    """The footprint (m) that makes the rays most likely which pass candidates' edges."""
+    totals = np.zeros(len(FOOTPRINTS))
+    for one in candidates:
+        beams, fit = before_others(one, candidates, sensor), one.fits[0]
+        for k, footprint in enumerate(FOOTPRINTS):
+            totals[k] += exact_costs(fit.kind, fit.p[None], beams, replace(sensor, footprint=footprint))[0]
+    return float(FOOTPRINTS[best]) if (best := int(np.argmin(totals))) > 1 else 0.0
+
+
+def measured_dispersion(candidates: Sequence[Candidate], sensor: Sensor) -> float:
+    """By how much the squared mean errors of scans' rays exceed what independent rays would make them; 1 at least."""
+    squares, scans = 0.0, 0
+    for one in candidates:
+        beams = before_others(one, candidates, sensor)
+        distance = _distance(one.now, beams)
+        error = (beams.rays[:, RANGE] - distance) / sensor.std
+        clear = (distance < beams.rays[:, STOP]) & (beams.kinds == MEASURED) & (np.abs(error) < CLEAR_ERROR)
+        error = _without_cut(error, np.minimum((beams.far - sensor.span - distance) / sensor.std, 0.0))
+        count = np.bincount(beams.scan[clear])
+        total = np.bincount(beams.scan[clear], error[clear])
+        many = count >= FEW_OF_SCAN
+        squares += float((total[many] ** 2 / count[many]).sum())
+        scans += int(np.count_nonzero(many))
+    return max(squares / scans, 1.0) if scans >= FEW else 1.0
+
+
+def _without_cut(error: FloatArray, cut: FloatArray) -> FloatArray:
+    """Errors (in standard deviations) of a normal distribution that ends at ``cut``, with mean 0 and variance 1."""
+    tail = np.exp(-(cut**2) / 2) / math.sqrt(2 * math.pi) / not_below(cut)
+    return np.asarray((error - tail) / np.sqrt(1 + cut * tail - tail**2))
+
+
+def _distance(primitive: Primitive, beams: Beams) -> FloatArray:
+    """Where (m) beams meet a primitive; FAR where they do not."""
+    distance = np.empty(len(beams))
+    trace(FAMILY[primitive.kind], parameters(primitive), beams.rays, distance)
+    return distance
 
 
 def measured_noise(candidates: Sequence[Candidate], sensor: Sensor) -> float:
@@ -253,8 +348,7 @@ def measured_noise(candidates: Sequence[Candidate], sensor: Sensor) -> float:
 
 def _met(candidate: Candidate, beams: Beams) -> tuple[FloatArray, NDArray[np.int8], FloatArray]:
     """Where (m) beams meet a candidate, what they measured (kind), and the range or its limit (m)."""
-    distance = np.empty(len(beams))
-    trace(FAMILY[candidate.now.kind], parameters(candidate.now), beams.rays, distance)
+    distance = _distance(candidate.now, beams)
     meets = (distance < beams.rays[:, STOP]) & (distance < beams.far)
     return distance[meets], beams.kinds[meets], beams.rays[meets, RANGE]
 
@@ -277,183 +371,11 @@ def _least(cost: Callable[[float], float], at: float, step: float = 0.5) -> floa
     return at
 
 
-def _ties() -> dict[Kind, FloatArray]:
-    """For each kind the matrix (5, K) from its own parameters to x, y, theta, width, height."""
-    full = np.eye(PARAMETERS)
-    tied = full[:, :4].copy()
-    tied[4, 3] = 1.0
-    return {
-        Kind.SQUARE: tied,
-        Kind.RECTANGLE: full,
-        Kind.CIRCLE: np.ascontiguousarray(tied[:, [0, 1, 3]]),
-        Kind.TRIANGLE: full,
-        Kind.ELLIPSE: full,
-    }
-
-
-TIES = _ties()
-"""For each kind the matrix (5, K) that maps its own parameters to x, y, theta, width, height."""
-
-NAMES = {kind: ("x", "y", *(() if kind is Kind.CIRCLE else ("theta",)), *SIZE_KEYS[kind]) for kind in Kind}
-"""For each kind its own parameters' names, in the order of TIES' columns."""
-
-HALF = (Kind.CIRCLE, Kind.ELLIPSE)
-"""Kinds whose sizes are half lengths."""
-
-PERIOD = {Kind.SQUARE: math.pi / 2, Kind.RECTANGLE: math.pi, Kind.TRIANGLE: 2 * math.pi, Kind.ELLIPSE: math.pi}
-
-
-def log_prior(kind: Kind) -> float:
-    """The logarithm of the density of a kind's parameters (but its place), before the rays are asked.
-
-    All sizes up to LONGEST and all angles are alike. A rectangle is found in one of two ways to name its sides (and
-    an ellipse its axes), each of them half of what it might be.
-    """
-    sizes = len(SIZE_KEYS[kind]) * math.log(2 / LONGEST if kind in HALF else 1 / LONGEST)
-    angle = -math.log(PERIOD[kind]) if kind in PERIOD else 0.0
-    return sizes + angle + (math.log(2) if kind in (Kind.RECTANGLE, Kind.ELLIPSE) else 0.0)
-
-
-MOMENTS = {
-    Kind.SQUARE: (12.0, 12.0),
-    Kind.RECTANGLE: (12.0, 12.0),
-    Kind.CIRCLE: (4.0, 4.0),
-    Kind.TRIANGLE: (24.0, 18.0),
-    Kind.ELLIPSE: (4.0, 4.0),
-}
-"""A size's square is so many times the variance of the area along it."""
-
-
-def starts(of: Primitive, kind: Kind) -> list[FloatArray]:
-    """Where the fit of a kind begins, for something that was first taken for ``of``: same place, same spread."""
-    x, y, theta, *sizes = parameters(of).tolist()
-    spread = [size / math.sqrt(factor) for size, factor in zip(sizes, MOMENTS[of.kind], strict=True)]
-    if of.kind is kind is not Kind.TRIANGLE:
-        turns = [0.0] if kind is Kind.CIRCLE else [0.0, math.pi / 4]
-    elif kind is Kind.TRIANGLE:
-        turns = [0.0, math.pi / 2, math.pi, -math.pi / 2]
-        if of.kind is kind:
-            turns += [2 * math.pi / 3, -2 * math.pi / 3]
-    else:
-        turns = [0.0] if kind is Kind.CIRCLE else [0.0, math.pi / 4]
-    made = []
-    mean = math.sqrt(spread[0] * spread[1])
-    for turn in turns:
-        along, across = spread
-        if abs(math.sin(turn)) > 0.9:
-            along, across = across, along
-        elif abs(math.sin(turn)) > 0.1 or kind in (Kind.SQUARE, Kind.CIRCLE):
-            along = across = mean
-        a, b = (math.sqrt(factor) for factor in MOMENTS[kind])
-        made.append(np.array([x, y, 0.0 if kind is Kind.CIRCLE else theta + turn, a * along, b * across]))
-    return made
-
-
-def search(candidate: Candidate, beams: Beams, sensor: Sensor) -> list[Fit]:
-    """Every kind fitted to a candidate's beams from all its starts, likeliest first.
-
-    Starts are fitted to some of the rays, and held against all of them, beside what the candidate was taken for; from
-    the best of each kind the fit goes on with all rays.
-    """
-    now = candidate.now
-    step = max(1, len(beams) // COARSE_RAYS)
-    tried = {kind: [_coarse(kind, p, beams, sensor, step).p for p in starts(now, kind)] for kind in Kind}
-    tried[now.kind].append(parameters(now))
-    ranked = {kind: _ranked(kind, ways, beams, sensor) for kind, ways in tried.items()}
-    limit = min(ways[0][0] for ways in ranked.values()) + HOPELESS
-    hopeful = {kind for kind, ways in ranked.items() if ways[0][0] < limit}
-    hopeful |= {simple for kind, simple in SIMPLER.items() if kind in hopeful}
-    return _ordered(
-        [
-            _fine(kind, [p for cost, p in ranked[kind] if cost < ranked[kind][0][0] + HOPELESS][:WAYS], beams, sensor)
-            for kind in Kind
-            if kind in hopeful
-        ]
-    )
-
-
-def _coarse(kind: Kind, p: FloatArray, beams: Beams, sensor: Sensor, step: int) -> Fit:
-    """A fit to every ``step``-th beam."""
-    return _fit(kind, p, beams, sensor, COARSE_BLURS, COARSE_STEPS, step)
-
-
-def _ranked(kind: Kind, ways: Sequence[FloatArray], beams: Beams, sensor: Sensor) -> list[tuple[float, FloatArray]]:
-    """Parameters of a kind with their costs (nats) over all beams, somewhat blurred, best first."""
-    out = np.empty(len(ways))
-    costs(FAMILY[kind], np.stack(ways), beams.rays, beams.kinds, sensor.std, sensor.table, float(FINE_BLURS[0]), out)
-    return sorted(zip(out.tolist(), ways, strict=True), key=lambda one: one[0])
-
-
-def again(candidate: Candidate, beams: Beams, sensor: Sensor) -> list[Fit]:
-    """A candidate's kinds fitted again, from where they are."""
-    return _ordered([_fine(fit.kind, [fit.p], beams, sensor) for fit in candidate.fits])
-
-
-def _fine(kind: Kind, ways: Sequence[FloatArray], beams: Beams, sensor: Sensor) -> Fit:
-    """The best fit to all beams from some ``ways``; a triangle's also with the other two corners as its apex."""
-    best = min((_fit(kind, p, beams, sensor, FINE_BLURS, FINE_STEPS) for p in ways), key=lambda fit: fit.cost)
-    if kind is not Kind.TRIANGLE:
-        return best
-    others = [_fit(kind, p, beams, sensor, FINE_BLURS, FINE_STEPS) for p in other_apexes(best.p)]
-    return min([best, *others], key=lambda fit: fit.cost)
-
-
-def other_apexes(p: FloatArray) -> list[FloatArray]:
-    """The isosceles triangles most like a triangle that have its other corners as apexes; none where they are unlike.
-
-    Where all sides are much alike, any corner may be taken for the apex.
-    """
-    x, y, theta, base, height = p.tolist()
-    leg = math.hypot(base / 2, height)
-    if not 1 / ALIKE < leg / base < ALIKE:
-        return []
-    mean = (leg + base) / 2  # of the two sides at the new apex; the new base is the leg across from it
-    tall = math.sqrt(mean**2 - leg**2 / 4)
-    turn = math.pi - math.atan2(height, base / 2)  # from the base to a leg, taken counter-clockwise
-    return [np.array([x, y, theta + way, leg, tall]) for way in (turn, -turn)]
-
-
 def before_others(candidate: Candidate, among: Sequence[Candidate], sensor: Sensor) -> Beams:
     """A candidate's beams, with what they say where they miss it."""
     others = [one.now for one in among if one is not candidate]
     assert candidate.map_behind is not None
     return behind(candidate.beams, candidate.map_behind, others, sensor)
-
-
-def _ordered(fits: Sequence[Fit]) -> list[Fit]:
-    """Fits by their evidence, as far as a Gaussian tells it, best first."""
-    return sorted(fits, key=lambda fit: -laplace(fit))
-
-
-def laplace(fit: Fit) -> float:
-    """The logarithm of a fit's evidence, where its likelihood is a Gaussian's."""
-    size = len(fit.information)
-    sign, log_determinant = np.linalg.slogdet(fit.information + np.eye(size))
-    volume = 0.5 * (size * math.log(2 * math.pi) - log_determinant)
-    return -fit.cost + volume + log_prior(fit.kind)
-
-
-def _fit(
-    kind: Kind, p: FloatArray, beams: Beams, sensor: Sensor, blurs: FloatArray, steps: int, step: int = 1
-) -> Fit:
-    """The nearest best fit of a kind."""
-    tie = TIES[kind]
-    found, information = p.copy(), np.zeros((tie.shape[1], tie.shape[1]))
-    cost = descend(
-        FAMILY[kind],
-        found,
-        tie,
-        beams.rays,
-        beams.kinds,
-        step,
-        sensor.std,
-        sensor.table,
-        blurs,
-        steps,
-        TOLERANCE,
-        information,
-    )
-    return Fit(kind, found, cost, information)
 
 
 def _once(candidates: Sequence[Candidate], sensor: Sensor) -> list[Candidate]:
@@ -480,180 +402,27 @@ def _share(a: Primitive, b: Primitive) -> float:
     return shared / min(first, second)
 
 
-def finish(candidate: Candidate, beams: Beams, whole: Backdrop, sensor: Sensor) -> Refined:
+def finish(candidate: Candidate, beams: Beams, map_alone: Backdrop, sensor: Sensor) -> Refined:
     """Weighs a candidate's kinds and gives the likeliest one's parameters, with their uncertainty."""
-    evidence = {fit.kind: laplace(fit) for fit in candidate.fits}
-    top = max(evidence.values())
-    sampled: dict[Kind, Sampled] = {}
-    for fit in candidate.fits:
-        if evidence[fit.kind] > top - CONTENDER:
-            sampled[fit.kind] = sample(fit, beams, sensor)
-            evidence[fit.kind] = sampled[fit.kind].evidence
-    kind = max(sampled, key=lambda one: evidence[one])
-    weights = {one: math.exp(value - evidence[kind]) for one, value in evidence.items()}
-    chances = {one: weights.get(one, 0.0) / sum(weights.values()) for one in Kind}
-    made = sampled[kind]
-    primitive, std, covariance = told(kind, made)
-    gain = float(-beams.rays[:, MISS].sum() - made.cost)
-    misfit, rays = misfit_of(primitive, beams, whole, sensor)
-    return Refined(primitive, std, covariance, chances, gain, misfit, rays)
+    told = weighed(candidate.fits, beams, sensor)
+    gain = float(-beams.rays[:, MISS].sum() - told.cost)
+    misfit, rays, seen = _held_against_map(told.primitive, beams, map_alone, sensor)
+    return Refined(told.primitive, told.std, told.covariance, told.chances, gain, misfit, rays, seen)
 
 
-def misfit_of(primitive: Primitive, beams: Beams, whole: Backdrop, sensor: Sensor) -> tuple[float, int]:
-    """By how much (nats a ray) the map explains the rays that meet a primitive better; and how many they are."""
-    distance = np.empty(len(beams))
-    trace(FAMILY[primitive.kind], parameters(primitive), beams.rays, distance)
+def _held_against_map(
+    primitive: Primitive, beams: Beams, map_alone: Backdrop, sensor: Sensor
+) -> tuple[float, int, float]:
+    """Of the rays that meet a primitive: by how much (nats each) the map explains them better, how many they are, and
+    in what share of the directions around it they meet it.
+    """
+    distance = _distance(primitive, beams)
     meets = distance < beams.rays[:, STOP]
     if not meets.any():
-        return 0.0, 0
-    stops = np.where(meets, distance, 1.0)
-    own = np.log(explained(beams, stops, meets, 0.0, sensor))
-    free = np.log(explained(beams, whole.stops, whole.ends, whole.spread, sensor))
-    return float((free - own)[meets].mean()), int(meets.sum())
-
-
-@dataclass(frozen=True)
-class Sampled:
-    """A kind's own parameters (K,): mean and covariance; the logarithm of its evidence; the mean's cost (nats)."""
-
-    mean: FloatArray
-    covariance: FloatArray
-    evidence: float
-    cost: float
-    effective: float
-
-
-def sample(fit: Fit, beams: Beams, sensor: Sensor) -> Sampled:
-    """A kind's parameters over all that rays allow, by importance sampling in rounds, each drawn from the last one's.
-
-    Rays that surely hit the shape are summed up once, as a parabola around the fit; what is left to be asked for each
-    sample is the few that pass so near to the silhouette that they might miss it or not.
-    """
-    tie = TIES[fit.kind]
-    size = tie.shape[1]
-    own = tie / (tie**2).sum(axis=0)
-    at = fit.p @ own
-    floor = np.array(LEAST_STD) @ own
-    mean, spread = at, _bounded(np.linalg.inv(fit.information + np.eye(size)), fit.kind, floor)
-    split = Split.of(fit, tie @ (16 * spread) @ tie.T, beams, sensor)
-    rounds = _draws(size)
-    for count, (standard, log_density) in enumerate(rounds, start=1):
-        lower = np.linalg.cholesky(spread)
-        points = mean + standard @ lower.T
-        cost = split.costs(points @ tie.T)
-        log_weight = -cost - log_density + np.log(np.diag(lower)).sum()
-        weight = np.exp(log_weight - log_weight.max())
-        share = _tempered(weight, EFFECTIVE if count < len(rounds) else 0.0)
-        mean = share @ points
-        centred = points - mean
-        spread = _bounded((share[:, None] * centred).T @ centred, fit.kind, floor)
-    evidence = float(log_weight.max() + np.log(weight.mean())) + log_prior(fit.kind)
-    return Sampled(mean, spread, evidence, float(split.costs((tie @ mean)[None])[0]), float(1 / (share**2).sum()))
-
-
-@dataclass(frozen=True)
-class Split:
-    """The cost of shapes near a fit: a parabola for the rays that surely hit, a constant for those that surely miss,
-    and the rays that might do either.
-    """
-
-    fit: Fit
-    constant: float
-    gradient: FloatArray
-    information: FloatArray
-    unsure: Beams
-    sensor: Sensor
-
-    @classmethod
-    def of(cls, fit: Fit, covariance: FloatArray, beams: Beams, sensor: Sensor) -> Split:
-        """Splits beams by whether they hit shapes whose parameters have a ``covariance`` (5, 5) around the fit's."""
-        sure = np.empty(len(beams))
-        margins(FAMILY[fit.kind], fit.p, covariance, beams.rays, sure)
-        hit, missed = sure > 1, sure < -1
-        gradient, information = np.zeros(PARAMETERS), np.zeros((PARAMETERS, PARAMETERS))
-        constant = slopes(
-            FAMILY[fit.kind],
-            fit.p,
-            beams.rays[hit],
-            beams.kinds[hit],
-            1,
-            sensor.std,
-            sensor.table,
-            1e-9,
-            gradient,
-            information,
-        )
-        constant -= float(beams.rays[missed, MISS].sum())
-        return cls(fit, constant, gradient, information, beams.of(~hit & ~missed), sensor)
-
-    def costs(self, shapes: FloatArray) -> FloatArray:
-        """The costs (nats) of shapes (M, 5); infinite where a size is none."""
-        moved = shapes - self.fit.p
-        parabola = self.constant + moved @ self.gradient + 0.5 * ((moved @ self.information) * moved).sum(axis=1)
-        return parabola + exact_costs(self.fit.kind, shapes, self.unsure, self.sensor)
-
-
-def _tempered(weight: FloatArray, least: float) -> FloatArray:
-    """Weights, made more alike until this share of the samples counts."""
-    power = 1.0
-    share = weight / weight.sum()
-    while 1 / (share**2).sum() < least * len(weight) and power > 1e-3:
-        power *= 0.7
-        share = weight**power / (weight**power).sum()
-    return np.asarray(share)
-
-
-def _bounded(covariance: FloatArray, kind: Kind, floor: FloatArray) -> FloatArray:
-    """A covariance that samples can be drawn with: no narrower than ``floor``, no wider in angle than MOST_TURN."""
-    bounded = covariance + np.diag(floor**2)
-    if kind is not Kind.CIRCLE and bounded[2, 2] > MOST_TURN**2:
-        shrink = np.ones(len(bounded))
-        shrink[2] = MOST_TURN / math.sqrt(bounded[2, 2])
-        bounded = bounded * shrink * shrink[:, None]
-    return np.asarray(bounded)
-
-
-@lru_cache(maxsize=8)
-def _draws(size: int) -> list[tuple[FloatArray, FloatArray]]:
-    """Each round's samples (N, K) of Student's t around 0, in pairs that mirror each other, and their log-densities.
-
-    They are the same every time.
-    """
-    rounds = []
-    rng = np.random.default_rng(size)
-    constant = math.lgamma((DEGREES + size) / 2) - math.lgamma(DEGREES / 2) - size / 2 * math.log(math.pi * DEGREES)
-    for count in SAMPLES:
-        normal = rng.standard_normal((count // 2, size))
-        half = normal * np.sqrt(DEGREES / rng.chisquare(DEGREES, count // 2))[:, None]
-        points = np.concatenate((half, -half))
-        density = constant - (DEGREES + size) / 2 * np.log1p((points**2).sum(axis=1) / DEGREES)
-        rounds.append((points, density))
-    return rounds
-
-
-def exact_costs(kind: Kind, shapes: FloatArray, beams: Beams, sensor: Sensor) -> FloatArray:
-    """The exact costs (nats) of shapes (M, 5); infinite where a size is none, or longer than any."""
-    out = np.empty(len(shapes))
-    longest = LONGEST / 2 if kind in HALF else LONGEST
-    right = ((shapes[:, 3:] > 1e-3) & (shapes[:, 3:] < longest)).all(axis=1)
-    safe = np.where(right[:, None], shapes, shapes[np.argmax(right)])
-    costs(FAMILY[kind], np.ascontiguousarray(safe), beams.rays, beams.kinds, sensor.std, sensor.table, 0.0, out)
-    return np.where(right, out, np.inf)
-
-
-def primitive_of(kind: Kind, p: FloatArray) -> Primitive:
-    """A primitive of five parameters, in canonical form."""
-    x, y, theta, width, height = p.tolist()
-    size = (width, height)[: len(SIZE_KEYS[kind])]
-    return Primitive(kind, x, y, None if kind is Kind.CIRCLE else theta, size).canonical()
-
-
-def told(kind: Kind, made: Sampled) -> tuple[Primitive, dict[str, float], FloatArray]:
-    """The primitive that samples tell, its standard deviations by name, and its covariance in their order."""
-    primitive = primitive_of(kind, TIES[kind] @ made.mean)
-    names, covariance = NAMES[kind], made.covariance
-    if kind in (Kind.RECTANGLE, Kind.ELLIPSE) and made.mean[3] < made.mean[4]:
-        order = [0, 1, 2, 4, 3]
-        covariance = covariance[np.ix_(order, order)]
-    std = np.sqrt(np.diag(covariance)).tolist()
-    return primitive, dict(zip(names, std, strict=True)), covariance
+        return 0.0, 0, 0.0
+    met = beams.of(meets)
+    own = np.log(explained(met, distance[meets], np.ones(len(met), np.bool_), 0.0, sensor))
+    free = np.log(explained(met, map_alone.stops[meets], map_alone.ends[meets], map_alone.spread, sensor))
+    points = met.rays[:, :2] + distance[meets, None] * met.rays[:, 2:4] - (primitive.x, primitive.y)
+    sectors = np.floor(np.arctan2(points[:, 1], points[:, 0]) / (2 * math.pi) * SECTORS).astype(int)
+    return float((free - own).mean()), len(met), len(np.unique(sectors)) / SECTORS

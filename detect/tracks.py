@@ -39,6 +39,9 @@ LEAST_GATE = 0.06
 PLACE_STD, SIZE_STD, ANGLE_STD = 0.012, 0.015, math.radians(8)
 """How far off one detection is (m, m, rad): about what the networks' errors are on noisy maps."""
 
+LEAST_STD = 1e-3
+"""Nothing is surer than this (m, rad) from one look to the next."""
+
 DRIFT = 0.3
 """Process noise between two looks, as a share of the above: looks at one growing map err alike, and things move."""
 
@@ -52,20 +55,22 @@ class _Hypothesis:
     score: float = 0.0
 
     @classmethod
-    def begin(cls, primitive: Primitive) -> _Hypothesis:
+    def begin(cls, detection: Detection) -> _Hypothesis:
         """From the first sighting."""
         from filterpy.kalman import KalmanFilter
 
+        primitive = detection.primitive
         state = _state(primitive)
-        noise = _noise(primitive)
+        noise = _noise(detection)
         made = KalmanFilter(dim_x=len(state), dim_z=len(state))
         made.x, made.P = state[:, None], noise.copy()
         made.F = made.H = np.eye(len(state))
         made.R, made.Q = noise, noise * DRIFT**2
-        return cls(primitive.kind, made)
+        return cls(primitive.kind, made, detection.score)
 
-    def update(self, primitive: Primitive, score: float) -> None:
+    def update(self, detection: Detection) -> None:
         """Adds a sighting; its angle is taken on the turn that is nearest to the state's."""
+        primitive = detection.primitive
         seen = _state(primitive)
         if primitive.theta is not None:
             held = self.primitive
@@ -73,9 +78,10 @@ class _Hypothesis:
             seen[2] = self.filter.x[2, 0] + (
                 0.0 if period is None else angle_difference(seen[2], self.filter.x[2, 0], period)
             )
-        self.filter.predict()
-        self.filter.update(seen[:, None], R=_noise(primitive) / max(score, 0.05))
-        self.score += score
+        noise = _noise(detection)
+        self.filter.predict(Q=noise * DRIFT**2)
+        self.filter.update(seen[:, None], R=noise / max(detection.score, 0.05))
+        self.score += detection.score
 
     @property
     def primitive(self) -> Primitive:
@@ -125,11 +131,9 @@ class Track:
         """A sighting."""
         primitive = detection.primitive
         if primitive.kind in self.hypotheses:
-            self.hypotheses[primitive.kind].update(primitive, detection.score)
+            self.hypotheses[primitive.kind].update(detection)
         else:
-            begun = _Hypothesis.begin(primitive)
-            begun.score = detection.score
-            self.hypotheses[primitive.kind] = begun
+            self.hypotheses[primitive.kind] = _Hypothesis.begin(detection)
         self.sightings += 1
         self.missed = 0
 
@@ -196,7 +200,10 @@ def _state(primitive: Primitive) -> NDArray[np.float64]:
     return np.array([primitive.x, primitive.y, *turn, *primitive.size])
 
 
-def _noise(primitive: Primitive) -> NDArray[np.float64]:
-    """Covariance of one sighting."""
+def _noise(detection: Detection) -> NDArray[np.float64]:
+    """Covariance of one sighting: its own where it was refined, else what networks' errors are."""
+    primitive = detection.primitive
+    if detection.std is not None:
+        return np.diag(np.square(list(detection.std.values())) + LEAST_STD**2)
     turn = [] if primitive.theta is None else [ANGLE_STD]
     return np.diag(np.square([PLACE_STD, PLACE_STD, *turn, *[SIZE_STD] * len(primitive.size)]))

@@ -106,6 +106,9 @@ def replay(
     detect_every: Annotated[
         int | None, typer.Option(metavar="N", help="Look for primitives every N scans as well as at the end.")
     ] = None,
+    no_refine: Annotated[
+        bool, typer.Option("--no-refine", help="Leave primitives as the networks read them: no fit to the rays.")
+    ] = False,
     weights: Annotated[
         Path | None,
         typer.Option(metavar="W.onnx", help="The detector's YOLO, or its folder. [default: what comes with prim]"),
@@ -167,6 +170,7 @@ def replay(
         map_every=map_every,
         detect=not no_detect,
         detect_every=detect_every,
+        refine=not no_refine,
         weights=weights,
         recover=recover,
     )

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from mapping.forward import cores
 from mapping.grid import OccupancyGrid
 from mapping.mapper import Mapper
 from prim.frames import Pose2D, Scan
@@ -33,10 +34,14 @@ class Identity:
 
 @dataclass(frozen=True)
 class Sighting:
-    """What was found in a map, each with its identity; where there is a truth, how it compares with that."""
+    """What was found in a map, each with its identity; where there is a truth, how it compares with that.
+
+    ``noise_std`` (m) is the range noise that refinement reckoned with; None where nothing was refined.
+    """
 
     detections: Detections
     identities: tuple[Identity, ...]
+    noise_std: float | None = None
     truth: tuple[Primitive, ...] = ()
     errors: DetectionErrors | None = None
 
@@ -45,16 +50,26 @@ class Lookout:
     """Looks for primitives with a detector: in the replay's map, or in one of its own where cells differ.
 
     ``own`` is a mapper with cells of the size that the detector reads; None where the replay's own map has them.
-    With ``tracker``, for a detector that looks more than once, what is found keeps its id.
+    With ``tracker``, for a detector that looks more than once, what is found keeps its id. With ``refines``, what is
+    found is fitted to the rays, whose noise is ``noise_std`` (m) where it is known.
     """
 
     def __init__(
-        self, detector: Detector, own: Mapper | None, truth: Truth | None, tracker: Tracker | None = None
+        self,
+        detector: Detector,
+        own: Mapper | None,
+        truth: Truth | None,
+        tracker: Tracker | None = None,
+        refines: bool = False,
+        noise_std: float | None = None,
     ) -> None:
         self._detector = detector
         self._tracker = tracker
         self._own = own
         self._truth = truth
+        self._noise_std = noise_std
+        self._scans: list[tuple[Scan, Pose2D]] = []
+        self.refines = refines
 
     def keep(self, scan: Scan, pose: Pose2D) -> None:
         """Adds a scan to the detector's own map, for a look at the end."""
@@ -63,25 +78,39 @@ class Lookout:
 
     def update(self, scan: Scan, pose: Pose2D) -> None:
         """Adds a scan to the detector's own map, for looks on the way."""
+        if self.refines:
+            self._scans.append((scan, pose))
         if self._own is not None:
             self._own.update(scan, pose)
 
-    def look(self, mapper: Mapper, stamp: int) -> Sighting:
-        """What is in the map so far."""
-        return self._sighting((self._own or mapper).grid(), stamp)
+    def map_so_far(self, mapper: Mapper) -> OccupancyGrid:
+        """The map that the detector looks at on the way."""
+        return (self._own or mapper).grid()
 
-    def look_at_last(self, grid: OccupancyGrid, stamp: int) -> Sighting:
-        """What is in the finished map."""
-        return self._sighting(grid if self._own is None else self._own.finish(), stamp)
+    def last_map(self, grid: OccupancyGrid) -> OccupancyGrid:
+        """The map that the detector looks at in the end, where the replay's own is ``grid``."""
+        return grid if self._own is None else self._own.finish()
 
-    def _sighting(self, grid: OccupancyGrid, stamp: int) -> Sighting:
-        detections = self._detector.detect(grid)
+    def detect(self, grid: OccupancyGrid) -> Detections:
+        """What the networks find in a map."""
+        return self._detector.detect(grid)
+
+    def refine(
+        self, detections: Detections, grid: OccupancyGrid, scans: Iterable[tuple[Scan, Pose2D]] | None = None
+    ) -> tuple[Detections, float | None]:
+        """Detections fitted to the rays of all ``scans``, or of those so far; and the noise (m) of these rays."""
+        from detect.refine import refine_detections  # when it is needed: a replay without it starts faster
+
+        return refine_detections(detections, self._scans if scans is None else scans, grid, self._noise_std, cores())
+
+    def sighting(self, detections: Detections, stamp: int, noise_std: float | None = None) -> Sighting:
+        """Detections with their identities, held against the truth at ``stamp`` (ns) where there is one."""
         identities = self._identities(detections)
         if self._truth is None:
-            return Sighting(detections, identities)
+            return Sighting(detections, identities, noise_std)
         true = tuple(self._truth.at(stamp).primitives)
         errors = detection_errors([one.primitive for one in detections.found], true)
-        return Sighting(detections, identities, true, errors)
+        return Sighting(detections, identities, noise_std, true, errors)
 
     def _identities(self, detections: Detections) -> tuple[Identity, ...]:
         """The detections' tracks; one after the other where there is one look only."""

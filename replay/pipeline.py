@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -67,6 +67,7 @@ class ReplayOptions:
     map_every: int | None = None
     detect: bool = True
     detect_every: int | None = None
+    refine: bool = True
     weights: Path | None = None
     recover: bool = False
 
@@ -84,8 +85,8 @@ class ReplayOptions:
             raise UsageError(f"--map-every is {self.map_every}: it must be at least 1")
         if self.detect_every is not None and self.detect_every < 1:
             raise UsageError(f"--detect-every is {self.detect_every}: it must be at least 1")
-        if not self.detect and (self.detect_every or self.weights):
-            raise UsageError("--no-detect excludes --detect-every and --weights")
+        if not self.detect and (self.detect_every or self.weights or not self.refine):
+            raise UsageError("--no-detect excludes --detect-every, --weights and --no-refine")
         if self.standing_still and (self.pose != "auto" or self.odom_topic):
             raise UsageError("--standing-still excludes --pose and --odom-topic")
         if self.odom_topic and self.pose not in ("auto", "odom"):
@@ -135,20 +136,25 @@ class Used:
 
 
 class Clock:
-    """Adds up the seconds spent in each stage."""
+    """Adds up the seconds spent in each stage; what is spent in a stage within another counts to the inner one."""
 
     def __init__(self) -> None:
         self.seconds: dict[str, float] = dict.fromkeys(("read", "localize", "map", "detect", "refine", "viewer"), 0.0)
         self._start = time.perf_counter()
+        self._within: list[float] = []
 
     @contextmanager
     def stage(self, name: str) -> Iterator[None]:
         """Counts the block's time to a stage."""
         start = time.perf_counter()
+        self._within.append(0.0)
         try:
             yield
         finally:
-            self.seconds[name] += time.perf_counter() - start
+            spent = time.perf_counter() - start
+            self.seconds[name] += spent - self._within.pop()
+            if self._within:
+                self._within[-1] += spent
 
     def total(self) -> float:
         """Seconds since the clock was made."""
@@ -212,7 +218,9 @@ class Pipeline:
             sighting = None
             if lookout is not None:
                 with self._clock.stage("detect"):
-                    sighting = lookout.look_at_last(grid, stamp)
+                    seen = lookout.last_map(grid)
+                posed = ((scan, pose) for _, scan, pose in self._posed(scans, poses))
+                sighting = self._sighting(lookout, seen, stamp, posed)
             self._note_what_was_used(scans, poses, used, grid)
             result = self._result(log, scans, poses, used, grid, mapper.noise_std, scores, sighting, judge)
             with self._clock.stage("viewer"):
@@ -320,10 +328,10 @@ class Pipeline:
             tracker = Tracker()
         cell = detector.card.resolution
         if np.isclose(options.resolution, cell, rtol=1e-6) and options.sensor_model == "eq4":
-            return Lookout(detector, None, truth, tracker)
+            return Lookout(detector, None, truth, tracker, options.refine, options.noise_std)
         noise_std = options.noise_std if options.mapper == "forward" else None
         own = make_mapper(options.mapper, cell, GridFrame.covering(frame.bounds, cell).bounds, "eq4", noise_std)
-        return Lookout(detector, own, truth, tracker)
+        return Lookout(detector, own, truth, tracker, options.refine, options.noise_std)
 
     def _posed(self, scans: ScanLog, poses: LaserPoses) -> Iterator[tuple[int, Scan, Pose2D]]:
         """The scans that have a pose: position, scan as seen from above, pose of the laser."""
@@ -425,9 +433,23 @@ class Pipeline:
             (lookout.update if every else lookout.keep)(scan, pose)
             if not every or (position + 1) % every:
                 return
-            sighting = lookout.look(mapper, stamp)
+            seen = lookout.map_so_far(mapper)
+        sighting = self._sighting(lookout, seen, stamp)
         with self._clock.stage("viewer"):
             self.viewer.show_sighting(position, stamp, sighting)
+
+    def _sighting(
+        self, lookout: Lookout, seen: OccupancyGrid, stamp: int, posed: Iterable[tuple[Scan, Pose2D]] | None = None
+    ) -> Sighting:
+        """Primitives in a map: detected, refined by the scans ``posed`` (or those so far), tracked."""
+        noise_std = None
+        with self._clock.stage("detect"):
+            detections = lookout.detect(seen)
+        if lookout.refines:
+            with self._clock.stage("refine"):
+                detections, noise_std = lookout.refine(detections, seen, posed)
+        with self._clock.stage("detect"):
+            return lookout.sighting(detections, stamp, noise_std)
 
     def _result(
         self,

@@ -56,6 +56,7 @@ def report(result: ReplayResult) -> dict[str, Any]:
             "scores": result.scores.to_json() if result.scores else None,
         },
         "primitives": _primitives(result.sighting),
+        "refine": {"noise_std_m": result.sighting.noise_std if result.sighting else None},
         "errors": _errors(result.sighting),
         "timing": {f"{name}_s": value for name, value in seconds.items()}
         | {
@@ -70,7 +71,14 @@ def _primitives(sighting: Sighting | None) -> list[dict[str, Any]]:
     if sighting is None:
         return []
     return [
-        {"id": identity.id} | one.primitive.to_json() | {"score": one.score, "stage": "detected", "std": None}
+        {"id": identity.id}
+        | one.primitive.to_json()
+        | {
+            "score": one.score,
+            "stage": "detected" if one.std is None else "refined",
+            "std": None if one.std is None else dict(one.std),
+            "chances": None if one.chances is None else {str(kind): chance for kind, chance in one.chances.items()},
+        }
         for identity, one in zip(sighting.identities, sighting.detections.found, strict=True)
     ]
 
@@ -192,6 +200,8 @@ def table(result: ReplayResult) -> list[tuple[str, str]]:
         ]  # fmt: skip
     if result.sighting is not None:
         rows.append(("primitives", _counted(result.sighting)))
+        if result.sighting.noise_std is not None and result.options.noise_std is None:
+            rows.append(("ray noise", f"{result.sighting.noise_std * 1000:.1f} mm (found on the primitives)"))
         if result.sighting.errors is not None:
             rows += _quality(result.sighting.errors)
     if result.blind is not None:

@@ -6,8 +6,8 @@ import math
 import os
 import socket
 import time
-from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 from urllib.parse import quote, urlsplit
@@ -22,9 +22,9 @@ from prim.errors import OutputError, PrimError, UsageError
 from prim.frames import Pose2D, Scan
 from prim.metrics import DetectionErrors, MapScores
 from prim.raycast import FloatArray
-from prim.shapes import Kind
+from prim.shapes import Kind, Primitive
 from prim.world import World
-from replay.lookout import Identity, Sighting
+from replay.lookout import Sighting
 from replay.pipeline import ReplayResult
 from replay.report import table
 from replay.show import Scene, ViewerOptions
@@ -80,6 +80,9 @@ KIND_COLORS: dict[Kind, Color] = {
     Kind.TRIANGLE: (204, 60, 150),
     Kind.ELLIPSE: (200, 130, 0),
 }
+
+BAND_ALPHA = 130
+"""How opaque the outlines of one standard deviation are."""
 
 SHARES = {
     "f1": ("F1", (255, 255, 255)),
@@ -186,6 +189,7 @@ class RerunViewer:
         self._at(position, stamp)
         found = sighting.detections.found
         self._recording.log("map/detections", self._outlines(found))
+        self._recording.log("map/uncertainty", self._bands(found))
         self._recording.log("map/labels", self._labels(sighting))
         self._recording.log("detections", rr.TextDocument(_detections_table(sighting), media_type="text/markdown"))
         self._recording.log("crops", rr.Image(_crops(found)))
@@ -203,6 +207,16 @@ class RerunViewer:
             [self._lifted(ring, FOUND_LIFT) for ring in rings],
             colors=[KIND_COLORS[one.primitive.kind] for one in found],
             radii=rr.Radius.ui_points(2.0),
+        )
+
+    def _bands(self, found: Sequence[Detection]) -> Any:
+        """Outlines one standard deviation within and without those of found primitives that were refined."""
+        edges = [(one.primitive.kind, edge) for one in found if one.std for edge in band(one.primitive, one.std)]
+        rings = [np.vstack((ring := edge.outline(64), ring[:1])) for _, edge in edges]
+        return rr.LineStrips3D(
+            [self._lifted(ring, FOUND_LIFT) for ring in rings],
+            colors=[(*KIND_COLORS[kind], BAND_ALPHA) for kind, _ in edges],
+            radii=rr.Radius.ui_points(0.8),
         )
 
     def _labels(self, sighting: Sighting) -> Any:
@@ -404,29 +418,50 @@ def _values(errors: DetectionErrors, series: Iterable[str], unit: float) -> list
 
 def _detections_table(sighting: Sighting) -> str:
     """Found primitives as a Markdown table: lengths in millimetres, angles in degrees."""
-    lines = ["| id | kind | score | x, mm | y, mm | angle | size, mm | ± of the track |", "|" + "---|" * 8]
+    lines = ["| id | kind | score | x, mm | y, mm | angle | size, mm | ± 1σ: mm, ° |", "|" + "---|" * 8]
     for identity, one in zip(sighting.identities, sighting.detections.found, strict=True):
         primitive = one.primitive
         angle = "" if primitive.theta is None else f"{math.degrees(primitive.theta):.1f}°"
-        size = ", ".join(f"{key.replace('_', ' ')} {1000 * value:.0f}" for key, value in primitive.sizes.items())
-        place = f"{1000 * primitive.x:.0f} | {1000 * primitive.y:.0f}"
-        cells = (identity.id, primitive.kind, f"{one.score:.2f}", place, angle, size, _spread(identity))
+        size = ", ".join(f"{key.replace('_', ' ')} {1000 * value:.1f}" for key, value in primitive.sizes.items())
+        place = f"{1000 * primitive.x:.1f} | {1000 * primitive.y:.1f}"
+        cells = (
+            identity.id,
+            primitive.kind,
+            f"{one.score:.2f}",
+            place,
+            angle,
+            size,
+            _spread(one.std or identity.std),
+        )
         lines.append(f"| {' | '.join(str(cell) for cell in cells)} |")
     return "\n".join(lines) + "\n"
 
 
-def _spread(identity: Identity) -> str:
-    """A track's standard deviations in words."""
-    if identity.std is None:
+def _spread(std: Mapping[str, float] | None) -> str:
+    """Standard deviations in words; nothing where they are not known."""
+    if std is None:
         return ""
     return ", ".join(
-        f"angle {math.degrees(std):.1f}°" if name == "theta" else f"{name.replace('_', ' ')} {1000 * std:.0f}"
-        for name, std in identity.std.items()
+        f"angle {math.degrees(value):.2f}°" if name == "theta" else f"{name.replace('_', ' ')} {1000 * value:.2f}"
+        for name, value in std.items()
     )
+
+
+def band(primitive: Primitive, std: Mapping[str, float]) -> Iterator[Primitive]:
+    """A primitive made smaller and larger by one standard deviation (m, by name) of its place and sizes together."""
+    place = math.sqrt((std["x"] ** 2 + std["y"] ** 2) / 2)
+    half = 1.0 if primitive.is_round else 0.5
+    for sign in (-1, 1):
+        sizes = tuple(
+            max(size + sign * math.hypot(half * std[name], place) / half, 1e-3)
+            for name, size in primitive.sizes.items()
+        )
+        yield replace(primitive, size=sizes)
 
 
 def _crops(found: Sequence[Detection]) -> NDArray[np.uint8]:
     """The crops as the networks see them, in rows, black where occupied; the largest y at the top."""
+    found = [one for one in found if one.crop.size]
     side = max((len(one.crop) for one in found), default=1)
     rows = max(1, -(-len(found) // CROPS_IN_A_ROW))
     sheet = np.full((rows * (side + 2), CROPS_IN_A_ROW * (side + 2)), 215, np.uint8)

@@ -1,0 +1,69 @@
+"""Things in a map that the networks did not take for primitives, and that may be some all the same.
+
+What hangs together in the map, is no larger than a primitive, and lies in none that was found, is proposed as a
+rectangle around it; refinement says whether the rays support it, and of which kind it is.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from detect.beams import MapCells, is_within
+from prim.raycast import FloatArray
+from prim.shapes import Kind, Primitive
+
+LEAST, MOST = 0.03, 0.7
+"""Between these (m) lies the extent of what is proposed."""
+
+LEAST_CELLS = 6
+COVERED = 0.3
+"""What lies by more than this share in a primitive that was found is a part of it."""
+
+NEAR = 0.03
+"""A cell this near (m) to a primitive counts as in it."""
+
+MOST_PROPOSALS = 24
+"""No more than so many are proposed, those of the most cells: a map that is full of specks says nothing."""
+
+
+def proposals(cells: MapCells, found: Sequence[Primitive]) -> list[Primitive]:
+    """Rectangles around things in a map that are in no primitive ``found``, the largest first."""
+    made = []
+    for points in blobs(cells):
+        inside = np.zeros(len(points), np.bool_)
+        for one in found:
+            inside |= is_within(one, points, NEAR)
+        if inside.mean() <= COVERED and (around := rectangle_around(points, cells.frame.resolution)):
+            made.append((len(points), around))
+    made.sort(key=lambda one: -one[0])
+    return [around for _, around in made[:MOST_PROPOSALS]]
+
+
+def blobs(cells: MapCells) -> Iterator[FloatArray]:
+    """The centres (N, 2) in metres of the cells of each thing that is not large."""
+    frame = cells.frame
+    order = np.argsort(cells.labels, axis=None, kind="stable")
+    numbers = cells.labels.ravel()[order]
+    first, last = np.searchsorted(numbers, [1, cells.labels.max() + 1])
+    for part in np.split(order[first:last], np.flatnonzero(np.diff(numbers[first:last])) + 1):
+        if len(part) >= LEAST_CELLS and not cells.large.flat[part[0]]:
+            rows, cols = np.divmod(part, frame.cols)
+            yield (np.column_stack((cols + frame.col, rows + frame.row)) + 0.5) * frame.resolution
+
+
+def rectangle_around(points: FloatArray, resolution: float) -> Primitive | None:
+    """The rectangle around points along their main axes; None where it is smaller or larger than primitives are."""
+    middle = points.mean(axis=0)
+    axes: NDArray[np.float64] = np.linalg.eigh(np.cov((points - middle).T) + np.eye(2) * 1e-12)[1]
+    along = (points - middle) @ axes
+    low, high = along.min(axis=0), along.max(axis=0)
+    height, width = (high - low + resolution).tolist()  # eigenvalues rise: the second axis is the longer one
+    if not LEAST <= max(width, height) <= MOST:
+        return None
+    x, y = (middle + axes @ ((low + high) / 2)).tolist()
+    theta = math.atan2(axes[1, 1], axes[0, 1])
+    return Primitive(Kind.RECTANGLE, x, y, theta, (width, max(height, LEAST))).canonical()
