@@ -20,6 +20,7 @@ from detect.raycost import (
     STOP,
     TOO_NEAR,
     TRIANGLE,
+    pass_by,
     tables,
     trace,
     walk,
@@ -40,6 +41,9 @@ DOUBT = 0.05
 
 NOTHING_BEYOND = 0.5
 """The chance that a ray which leaves the map meets nothing at all."""
+
+ALIKE_NATS, ALIKE_STOPS, ALIKE_SHARE = 0.5, 0.01, 0.01
+"""Beams have changed where more than such a share of them says something else (nats), or is stopped elsewhere (m)."""
 
 LARGE = 0.75
 """What hangs together over more than this (m) is no primitive."""
@@ -71,6 +75,18 @@ class Beams:
 
     def __len__(self) -> int:
         return len(self.rays)
+
+    def passing(self, primitive: Primitive, reach: float) -> NDArray[np.bool_]:
+        """Which of them come within ``reach`` (m) of a primitive."""
+        aside = np.empty(len(self))
+        pass_by(FAMILY[primitive.kind], parameters(primitive), self.rays, aside)
+        return aside > -reach
+
+    def much_alike(self, other: Beams) -> bool:
+        """Whether all but a few of the same beams say much the same where they miss."""
+        differ = np.abs(self.rays[:, MISS] - other.rays[:, MISS]) > ALIKE_NATS
+        differ |= np.abs(np.minimum(self.rays[:, STOP], FAR) - np.minimum(other.rays[:, STOP], FAR)) > ALIKE_STOPS
+        return bool(np.mean(differ) < ALIKE_SHARE)
 
     @classmethod
     def joined(cls, parts: Sequence[Beams]) -> Beams:
@@ -192,11 +208,12 @@ def gather(
 @dataclass(frozen=True)
 class MapCells:
     """A map's occupied cells (rows, cols), numbered by what hangs together (0: not occupied), and which of them
-    belong to something larger than any primitive.
+    belong to something larger than any primitive; and its free cells.
     """
 
     frame: GridFrame
     occupied: NDArray[np.bool_]
+    free: NDArray[np.bool_]
     labels: NDArray[np.int32]
     large: NDArray[np.bool_]
 
@@ -212,7 +229,7 @@ class MapCells:
             for number, (rows, cols) in enumerate(ndimage.find_objects(labels), start=1)
             if max(rows.stop - rows.start, cols.stop - cols.start) > cells
         ]
-        return cls(grid.frame, grid.occupied, labels, np.isin(labels, large))
+        return cls(grid.frame, grid.occupied, grid.free, labels, np.isin(labels, large))
 
     def without(self, primitives: Sequence[Primitive], margin: float) -> NDArray[np.bool_]:
         """The occupied cells (rows, cols) but for those of the primitives and within ``margin`` (m) of them.
@@ -242,7 +259,7 @@ def _cells_around(frame: GridFrame, primitive: Primitive, reach: float) -> tuple
     return slice(row, last_row), slice(col, last_col), np.stack(np.meshgrid(x, y), axis=-1)
 
 
-def is_within(primitive: Primitive, points: FloatArray, margin: float) -> NDArray[np.bool_]:
+def is_within(primitive: Primitive, points: NDArray[np.floating], margin: float) -> NDArray[np.bool_]:
     """Which points (..., 2) lie in a primitive or no more than ``margin`` (m) outside of it (corners cut square)."""
     cos, sin = math.cos(primitive.theta or 0.0), math.sin(primitive.theta or 0.0)
     local = (points - (primitive.x, primitive.y)) @ np.array([[cos, -sin], [sin, cos]])
@@ -267,6 +284,10 @@ class Backdrop:
     blocked: NDArray[np.bool_]
     spread: float
 
+    def of(self, chosen: NDArray[np.bool_]) -> Backdrop:
+        """What stands behind some of the beams."""
+        return Backdrop(self.stops[chosen], self.ends[chosen], self.blocked[chosen], self.spread)
+
 
 def backdrop(beams: Beams, occupied: NDArray[np.bool_], frame: GridFrame) -> Backdrop:
     """What stands behind a primitive whose cells are cleared; a cell tells it to within a cell."""
@@ -282,13 +303,21 @@ def behind(beams: Beams, map_behind: Backdrop, others: Sequence[Primitive], sens
     miss = np.log(explained(beams, stops, ends, map_behind.spread, sensor))
     nearest = np.full(len(beams), FAR)
     for other in others:
-        distance = np.empty(len(beams))
-        trace(FAMILY[other.kind], parameters(other), beams.rays, distance)
-        np.minimum(nearest, distance, out=nearest)
+        _shorten(nearest, beams, other)
     first = nearest < stops
     rays[:, STOP] = np.where(map_behind.blocked, 0.0, nearest)
     rays[:, MISS] = np.where(first, log_likelihood(beams, np.where(first, nearest, 1.0), sensor), miss)
     return replace(beams, rays=rays)
+
+
+def _shorten(nearest: FloatArray, beams: Beams, other: Primitive) -> None:
+    """Cuts distances (N,) of beams down to where another primitive stops them."""
+    x, y = other.x - beams.rays[:, 0], other.y - beams.rays[:, 1]
+    aside = np.abs(x * beams.rays[:, 3] - y * beams.rays[:, 2])
+    near = np.flatnonzero(aside < circumradius(other))
+    distance = np.empty(len(near))
+    trace(FAMILY[other.kind], parameters(other), beams.rays[near], distance)
+    nearest[near] = np.minimum(nearest[near], distance)
 
 
 def log_likelihood(beams: Beams, distance: FloatArray, sensor: Sensor) -> FloatArray:

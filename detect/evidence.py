@@ -39,6 +39,11 @@ HALF = (Kind.CIRCLE, Kind.ELLIPSE)
 PERIOD = {Kind.SQUARE: math.pi / 2, Kind.RECTANGLE: math.pi, Kind.TRIANGLE: 2 * math.pi, Kind.ELLIPSE: math.pi}
 
 
+def longest(kind: Kind) -> float:
+    """What a kind's sizes stay below (m)."""
+    return LONGEST / 2 if kind in HALF else LONGEST
+
+
 def log_prior(kind: Kind) -> float:
     """The logarithm of the density of a kind's parameters (but its place), before the rays are asked.
 
@@ -188,8 +193,7 @@ def _draws(size: int) -> list[tuple[FloatArray, FloatArray]]:
 def exact_costs(kind: Kind, shapes: FloatArray, beams: Beams, sensor: Sensor) -> FloatArray:
     """The exact costs (nats) of shapes (M, 5); infinite where a size is none, or longer than any."""
     out = np.empty(len(shapes))
-    longest = LONGEST / 2 if kind in HALF else LONGEST
-    right = np.asarray(((shapes[:, 3:] > 1e-3) & (shapes[:, 3:] < longest)).all(axis=1))
+    right = np.asarray(((shapes[:, 3:] > 1e-3) & (shapes[:, 3:] < longest(kind))).all(axis=1))
     safe = np.where(right[:, None], shapes, shapes[np.argmax(right)])
     costs(
         FAMILY[kind],
@@ -217,8 +221,14 @@ class Weighed:
     cost: float
 
 
-def weighed(fits: Sequence[Fit], beams: Beams, sensor: Sensor) -> Weighed:
-    """Fits of several kinds to the same beams, weighed by their evidence; no kind is likelier beforehand."""
+def weighed(fits: Sequence[Fit], beams: Beams, sensor: Sensor) -> Weighed | None:
+    """Fits of several kinds to the same beams, weighed by their evidence; no kind is likelier beforehand.
+
+    None where all of them are larger than a primitive is.
+    """
+    fits = [fit for fit in fits if (fit.p[3:] < longest(fit.kind)).all()]
+    if not fits:
+        return None
     rough = {fit.kind: laplace(fit, sensor.dispersion) for fit in fits}
     top = max(rough.values())
     sampled = {fit.kind: sample(fit, beams, sensor) for fit in fits if rough[fit.kind] > top - CONTENDER}

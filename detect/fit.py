@@ -15,15 +15,17 @@ from prim.shapes import SIZE_KEYS, Kind, Primitive
 
 COARSE_RAYS = 800
 COARSE_BLURS = (0.03, 0.012)
-FINE_BLURS = (0.008, 0.003, 0.001)
+FINE_BLURS = (0.008, 0.001)
 """Fits go from one blur (m, half a footprint) to the next; the last is no smaller than the sensor's own."""
 
-COARSE_STEPS, FINE_STEPS = 10, 12
-TOLERANCE = 0.02
+COARSE_STEPS, FINE_STEPS = 8, 10
+TOLERANCE = 0.05
 """A fit ends where a step gains less than this (nats)."""
 
-HOPELESS = 60.0
-"""A kind whose coarse fit is this much (nats) less likely than the best one's is not fitted to all rays."""
+HOPELESS, HOPELESS_WAY = 60.0, 20.0
+"""A kind whose coarse fit is this much (nats) less likely than the best one's is not fitted to all rays, nor is
+another way to the same kind by so much.
+"""
 
 WAYS = 2
 """So many of a kind's coarse fits are gone on with."""
@@ -115,7 +117,7 @@ def search(now: Primitive, beams: Beams, sensor: Sensor) -> list[Fit]:
     hopeful = {kind for kind, ways in ranked.items() if ways[0][0] < limit}
     hopeful |= {simple for kind, simple in SIMPLER.items() if kind in hopeful}
     return [
-        _fine(kind, [p for cost, p in ranked[kind] if cost < ranked[kind][0][0] + HOPELESS][:WAYS], beams, sensor)
+        _fine(kind, [p for cost, p in ranked[kind] if cost < ranked[kind][0][0] + HOPELESS_WAY][:WAYS], beams, sensor)
         for kind in Kind
         if kind in hopeful
     ]

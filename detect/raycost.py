@@ -211,6 +211,15 @@ def share_hit(s: float, blur: float) -> float:
 
 
 @kernel
+def pass_by(family: int, p: Any, beams: Any, out: Any) -> None:
+    """By how much (N,) the lines of beams hit a shape (m), below 0 for a miss; -FAR where it lies behind them."""
+    cos, sin = math.cos(p[THETA]), math.sin(p[THETA])
+    dr, ds = np.zeros(PARAMETERS), np.zeros(PARAMETERS)
+    for i in range(len(beams)):
+        out[i] = told_by(family, p, cos, sin, beams[i], FAR, dr, ds)[1]
+
+
+@kernel
 def trace(family: int, p: Any, beams: Any, out: Any) -> None:
     """Distances (N,) of beams to a shape, FAR for a miss; 0 from inside."""
     cos, sin = math.cos(p[THETA]), math.sin(p[THETA])

@@ -43,14 +43,15 @@ from detect.evidence import exact_costs, laplace, weighed
 from detect.fit import Fit, again, primitive_of, search
 from detect.proposals import proposals
 from detect.raycost import MEASURED, MISS, RANGE, STOP, not_below, trace
+from detect.walls import walls_behind
 from mapping.grid import OccupancyGrid
 from prim.frames import Pose2D, Scan
 from prim.metrics import polygon_areas
 from prim.raycast import FloatArray
 from prim.shapes import Kind, Primitive
 
-REACH = 0.07
-"""Rays that come within this (m) of a candidate are looked at."""
+REACH, REACH_FITTED = 0.07, 0.03
+"""Rays that come within this (m) of a candidate are looked at: at first, and once it is fitted."""
 
 ROUNDS = 2
 """So often all candidates are fitted beside each other, once they are told apart."""
@@ -79,7 +80,7 @@ SAME = 0.25
 CLEARED_FIRST, CLEARED = 0.03, 0.02
 """So far (m) around a candidate the map's cells are its own, not what stands behind: at first, and once fitted."""
 
-MOVED, MOVED_SHARE = 0.05, 0.005
+MOVED, MOVED_SHARE = 0.05, 0.03
 """What stands behind has changed where more than such a share of rays ends elsewhere (m): all is fitted anew."""
 
 FEW = 20
@@ -129,7 +130,15 @@ class Candidate:
     start: Primitive
     beams: Beams
     map_behind: Backdrop | None = None
+    walls: list[Primitive] = field(default_factory=list)
     fits: list[Fit] = field(default_factory=list)
+    fitted_to: tuple[Sensor, Beams] | None = None
+
+    def look_at(self, chosen: NDArray[np.bool_]) -> None:
+        """Leaves out all other beams."""
+        self.beams = self.beams.of(chosen)
+        self.map_behind = self.map_behind and self.map_behind.of(chosen)
+        self.fitted_to = self.fitted_to and (self.fitted_to[0], self.fitted_to[1].of(chosen))
 
     @property
     def now(self) -> Primitive:
@@ -175,7 +184,7 @@ def refine_detections(
 def contradiction(made: Refined | None) -> str:
     """Why the rays speak against a primitive; nothing where they do not."""
     if made is None:
-        return "no ray passes it, or a likelier one stands in its place"
+        return "no ray passes it, a likelier one stands in its place, or it is larger than primitives are"
     if made.gain < LEAST_GAIN:
         return f"the rays are likelier with it by {made.gain:.0f} nats only, less than {LEAST_GAIN:g}"
     if made.misfit > MOST_MISFIT:
@@ -226,30 +235,40 @@ def refine(
         look_behind(seen, cells, CLEARED_FIRST)
         fit_all(pool, seen, [True] * len(seen), sensor)
         alone = _once(seen, sensor)
-        sensor = measured(alone, sensor, noise_std)
+        for one in alone:
+            one.look_at(one.beams.passing(one.now, REACH_FITTED))
+        sensor = Sensor.of(noise_std or measured_noise(alone, sensor), span)
         for _ in range(ROUNDS):
             changed = look_behind(alone, cells, CLEARED)
             fit_all(pool, alone, changed, sensor)
-            sensor = measured(alone, sensor, noise_std)
-        beams = [before_others(one, alone, sensor) for one in alone]
+        sensor = measured(alone, sensor, noise_std)
+        fit_all(pool, alone, [False] * len(alone), sensor)
         whole = [backdrop(one.beams, cells.occupied, cells.frame) for one in alone]
-        refined = list(pool.map(lambda one, own, alone: finish(one, own, alone, sensor), alone, beams, whole))
+        refined = list(pool.map(lambda one, map_alone: finish(one, map_alone, sensor), alone, whole))
     made = {id(one): result for one, result in zip(alone, refined, strict=True)}
     return [made.get(id(one)) for one in candidates], sensor.std
 
 
 def fit_all(pool: Executor, candidates: Sequence[Candidate], anew: Sequence[bool], sensor: Sensor) -> None:
-    """Fits all candidates beside what was known of the others before: ``anew``, or from where they are."""
+    """Fits all candidates beside what was known of the others before: ``anew``, or from where they are.
+
+    Where hardly anything has changed behind and before a candidate, it stays as it is.
+    """
     beams = [before_others(one, candidates, sensor) for one in candidates]
-    fits = pool.map(lambda one, own, new: _fitted(one, own, sensor, new), candidates, beams, anew)
-    for one, found in zip(candidates, list(fits), strict=True):
-        one.fits = found
+    list(pool.map(lambda one, own, new: _fit_one(one, own, sensor, new), candidates, beams, anew))
 
 
-def _fitted(candidate: Candidate, beams: Beams, sensor: Sensor, anew: bool) -> list[Fit]:
-    """A candidate's kinds, likeliest first, as far as a Gaussian tells their evidence."""
-    fits = search(candidate.now, beams, sensor) if anew else again(candidate.fits, beams, sensor)
-    return sorted(fits, key=lambda fit: -laplace(fit))
+def _fit_one(candidate: Candidate, beams: Beams, sensor: Sensor, anew: bool) -> None:
+    """Leaves a candidate's kinds, likeliest first, as far as a Gaussian tells their evidence."""
+    before = candidate.fitted_to
+    if anew or before is None:
+        fits = search(candidate.now, beams, sensor)
+    elif before[0] is sensor and before[1].much_alike(beams):
+        return
+    else:
+        fits = again(candidate.fits, beams, sensor)
+    candidate.fits = sorted(fits, key=lambda fit: -laplace(fit))
+    candidate.fitted_to = sensor, beams
 
 
 def look_behind(candidates: Sequence[Candidate], cells: MapCells, margin: float) -> list[bool]:
@@ -257,11 +276,16 @@ def look_behind(candidates: Sequence[Candidate], cells: MapCells, margin: float)
 
     Whose cells are a candidate's is better known the second time; returns for which that changed much.
     """
-    occupied = cells.without([one.now for one in candidates], margin)
+    shapes = [one.now for one in candidates]
+    occupied = cells.without(shapes, margin)
+    walls = walls_behind(cells, shapes)
+    for wall in walls:
+        occupied &= ~wall.cells
     changed = []
     for one in candidates:
         before = one.map_behind
         one.map_behind = backdrop(one.beams, occupied, cells.frame)
+        one.walls = [wall.stretch for wall in walls]
         moved = before is None or np.mean(np.abs(before.stops - one.map_behind.stops) > MOVED) > MOVED_SHARE
         changed.append(bool(moved))
     return changed
@@ -375,7 +399,7 @@ def before_others(candidate: Candidate, among: Sequence[Candidate], sensor: Sens
     """A candidate's beams, with what they say where they miss it."""
     others = [one.now for one in among if one is not candidate]
     assert candidate.map_behind is not None
-    return behind(candidate.beams, candidate.map_behind, others, sensor)
+    return behind(candidate.beams, candidate.map_behind, [*others, *candidate.walls], sensor)
 
 
 def _once(candidates: Sequence[Candidate], sensor: Sensor) -> list[Candidate]:
@@ -402,9 +426,13 @@ def _share(a: Primitive, b: Primitive) -> float:
     return shared / min(first, second)
 
 
-def finish(candidate: Candidate, beams: Beams, map_alone: Backdrop, sensor: Sensor) -> Refined:
+def finish(candidate: Candidate, map_alone: Backdrop, sensor: Sensor) -> Refined | None:
     """Weighs a candidate's kinds and gives the likeliest one's parameters, with their uncertainty."""
+    assert candidate.fitted_to is not None
+    beams = candidate.fitted_to[1]
     told = weighed(candidate.fits, beams, sensor)
+    if told is None:
+        return None
     gain = float(-beams.rays[:, MISS].sum() - told.cost)
     misfit, rays, seen = _held_against_map(told.primitive, beams, map_alone, sensor)
     return Refined(told.primitive, told.std, told.covariance, told.chances, gain, misfit, rays, seen)
