@@ -20,8 +20,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bench.detect import timed
-from detect.dataset import Sample, samples
-from detect.evaluate import BATCH, Pictured, mark, read_image
+from detect.dataset import Sample, read_image, samples
+from detect.evaluate import BATCH, Pictured, mark
 from detect.scores import score_boxes
 from detect.weights import DETECTOR, Weights, load_weights
 from detect.yolo import Yolo

@@ -116,7 +116,7 @@ def outcome(seed: int, noise_std: float, mapper: str) -> Outcome:
                 end_points(session, true),
             )
         )
-    networks = [pair for pair in match_primitives([d.primitive for d in detections.found], session.primitives)]
+    networks = match_primitives([one.primitive for one in detections.found], session.primitives)
     return Outcome(
         tuple(rows),
         len(primitives),
@@ -247,7 +247,8 @@ def peers_table(noise_std: float, of: Sequence[Outcome]) -> str:
         ours = np.median([(row.place, sum(row.sizes) / 2) for row in rows], axis=0)
         theirs = np.median(errors, axis=0)
         factor = "–" if not ours.all() else f"{theirs[0] / ours[0]:.0f} × / {theirs[1] / ours[1]:.0f} ×"
-        return f"{1000 * ours[0]:.2f} / {1000 * ours[1]:.2f} | {1000 * theirs[0]:.1f} / {1000 * theirs[1]:.1f} | {factor}"
+        mine, other = 1000 * ours, 1000 * theirs
+        return f"{mine[0]:.2f} / {mine[1]:.2f} | {other[0]:.1f} / {other[1]:.1f} | {factor}"
 
     found = [row for one in of for row in one.primitives if row.found]
     opencv = [row for row in found if row.opencv]
@@ -267,7 +268,7 @@ def main() -> None:
     parser.add_argument("--update", type=Path)
     options = parser.parse_args()
     errors = [
-        "| noise | F1: networks | OpenCV | **refined** | kind right | place, mm | size, mm | angle, ° | z | ms each |",
+        "| noise | F1: networks | OpenCV | **refined** | kind | place, mm | size, mm | angle, ° | z | ms each |",
         "|---|" + "---:|" * 9,
     ]
     limits = ["| noise | kind | found | x | y | angle | size | size 2 |", "|---|---|" + "---:|" * 6]

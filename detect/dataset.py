@@ -302,3 +302,10 @@ def _sample(folder: Path, mapper: str, split: str, path: Path) -> Sample:
     primitives = tuple(Primitive.from_json(value) for value in truth["primitives"])
     image = folder / "images" / mapper / split / f"{path.stem}.png"
     return Sample(image, GridFrame(**truth["frame"]), primitives, truth["noise_std"])
+
+
+def read_image(sample: Sample) -> NDArray[np.uint8]:
+    """A sample's image (TILE, TILE, 3)."""
+    from PIL import Image
+
+    return np.asarray(Image.open(sample.image))

@@ -12,7 +12,7 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from detect.dataset import Sample, box_of
+from detect.dataset import Sample, box_of, read_image
 from detect.detector import FLOOR as CANDIDATE
 from detect.detector import OVERLAP_LIMIT, Detection, Detector
 from detect.estimator import Found
@@ -165,13 +165,6 @@ def thinned(boxes: Boxes) -> Boxes:
     stay = np.flatnonzero(suppress(boxes, SUPPRESSION, per_kind=True) == np.arange(len(boxes)))
     best = stay[np.argsort(-boxes.score[stay], kind="stable")]
     return boxes[best[:MOST]]
-
-
-def read_image(sample: Sample) -> NDArray[np.uint8]:
-    """A sample's image (TILE, TILE, 3)."""
-    from PIL import Image
-
-    return np.asarray(Image.open(sample.image))
 
 
 def _timed(call: Callable[[], Result]) -> tuple[Result, float]:

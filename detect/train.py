@@ -9,7 +9,7 @@ import json
 import os
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from hashlib import sha256
 from pathlib import Path
 from typing import Any
@@ -18,7 +18,8 @@ import numpy as np
 import torch
 
 from detect.crops import Crops, gather
-from detect.dataset import samples, style_of
+from detect.dataset import read_image, samples, style_of
+from detect.export import reopen_cnn, reopen_yolo
 from detect.networks import ParameterNetwork
 from detect.parameters import PAPER, PRESETS, PRIM, targets
 from prim.errors import UsageError
@@ -92,7 +93,10 @@ def train_cnn(
     if not len(training):
         raise UsageError(f"{data} holds no {' or '.join(kinds)} to learn from")
     network = ParameterNetwork(kinds, PRESETS[options.preset], options.channels)
-    if options.start is not None:
+    if options.start is not None and options.start.suffix == ".onnx":
+        few = [training.exact(i, network.preset) for i in range(min(len(training), options.batch))]
+        reopen_cnn(options.start, network, as_input(few, network.channels))
+    elif options.start is not None:
         network.load_state_dict(_weights_of(options.start, network))
     network.to(memory_format=torch.channels_last)  # what convolutions on a CPU are three times faster with
     optimizer = torch.optim.Adam(network.parameters(), lr=options.learning_rate)
@@ -239,7 +243,7 @@ class YoloOptions:
     seed: int = 0
 
     def __post_init__(self) -> None:
-        if self.start is not None and not self.trust:
+        if self.start is not None and self.start.suffix != ".onnx" and not self.trust:
             raise UsageError(
                 f"{self.start} is a pickle, which can run code: add --trust if you know where it is from"
             )
@@ -272,6 +276,8 @@ def train_yolo(data: Path, mapper: str, output: Path, options: YoloOptions) -> P
     settings.update({"sync": False})
     _claim(output, {"mapper": mapper, "set": _manifest(data), "options": _plain(asdict(options))})
     best, last = (output / "weights" / name for name in ("best.pt", "last.pt"))
+    if options.start is not None and options.start.suffix == ".onnx":
+        options = replace(options, start=_reopened(options.start, data, mapper, output / "start.pt"))
     if not (output / FINISHED).exists():
         with fast_arithmetic():
             if not last.exists():
@@ -280,6 +286,15 @@ def train_yolo(data: Path, mapper: str, output: Path, options: YoloOptions) -> P
                 YOLO(str(last)).train(resume=True, trainer=_trainer())
         (output / FINISHED).touch()
     return best
+
+
+def _reopened(start: Path, data: Path, mapper: str, output: Path) -> Path:
+    """An ONNX file as weights to train on, its normalisations settled on images of the set."""
+    if output.exists():
+        return output
+    few = [read_image(sample) for sample in samples(data, mapper, "train")[: YoloOptions.batch]]
+    images = torch.from_numpy(np.stack(few)).permute(0, 3, 1, 2).float() / 255
+    return reopen_yolo(start, images, output)
 
 
 def _claim(output: Path, asked: dict[str, Any]) -> None:
