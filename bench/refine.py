@@ -26,6 +26,7 @@ from bench import classical
 from bench.limit import bounds, ratio
 from bench.maps import session_of, update
 from bench.sessions import Session
+from detect.cells import is_within
 from detect.detector import Detector
 from detect.fit import NAMES
 from detect.refine import refine_detections
@@ -42,7 +43,8 @@ ARENA = np.array([(-1, -1, 1, -1), (1, -1, 1, 1), (1, 1, -1, 1), (-1, 1, -1, -1)
 @dataclass(frozen=True)
 class Found:
     """One true primitive: whether it was found, its kind right where it was seen, errors (m, rad) of the kind's own
-    parameters, in standard deviations as told, their limits; and mean errors of size (m) and place (m) of the peers.
+    parameters, their standard deviations as told, the bounds of Chapman and Robbins (for unbiased estimates) and of
+    Weiss and Weinstein (the limit of any); and the peers' mean errors (m) of place and size.
     """
 
     kind: Kind
@@ -51,6 +53,7 @@ class Found:
     found: bool
     errors: tuple[float, ...] = ()
     stds: tuple[float, ...] = ()
+    unbiased: tuple[float, ...] = ()
     limits: tuple[float, ...] = ()
     place: float = math.nan
     angle: float | None = None
@@ -108,7 +111,8 @@ def outcome(seed: int, noise_std: float, mapper: str) -> Outcome:
                 True,
                 own_errors(one, true),
                 tuple(stds[pair.detection][name] for name in names),
-                tuple(limits[k].tolist()),
+                tuple(limits[k].chapman_robbins.tolist()),
+                tuple(limits[k].weiss_weinstein.tolist()),
                 pair.position,
                 angle_error(one, true),
                 (pair.width, pair.height),
@@ -139,8 +143,6 @@ def own_errors(one: Primitive, true: Primitive) -> tuple[float, ...]:
 
 def end_points(session: Session, true: Primitive) -> tuple[float, float] | None:
     """Errors of place and size (m) of a circle or rectangle that is fitted to the end points near it."""
-    from detect.beams import is_within
-
     if true.kind not in (Kind.CIRCLE, Kind.RECTANGLE, Kind.SQUARE):
         return None
     points = np.concatenate([scan.points(pose) for scan, pose in session.scans])
@@ -233,7 +235,9 @@ def limits_table(noise_std: float, of: Sequence[Outcome]) -> list[str]:
                 cells.append("")
                 continue
             at = NAMES[kind].index(key)
-            cells.append(f"{ratio([row.errors[at] for row in found], [row.limits[at] for row in found]):.2f}")
+            errors = [row.errors[at] for row in found]
+            factors = (ratio(errors, [getattr(row, name)[at] for row in found]) for name in ("limits", "unbiased"))
+            cells.append(" / ".join(f"{factor:.2f}" for factor in factors))
         lines.append(f"| {1000 * noise_std:g} mm | {kind} | {len(found)} | {' | '.join(cells)} |")
     return lines
 

@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from detect.cells import circumradius
 from detect.raycost import (
     BOX,
     DISC,
@@ -25,7 +26,7 @@ from detect.raycost import (
     trace,
     walk,
 )
-from mapping.grid import GridFrame, OccupancyGrid
+from mapping.grid import GridFrame
 from prim.frames import Pose2D, Scan
 from prim.raycast import FloatArray
 from prim.shapes import Kind, Primitive
@@ -44,12 +45,6 @@ NOTHING_BEYOND = 0.5
 
 ALIKE_NATS, ALIKE_STOPS, ALIKE_SHARE = 0.5, 0.01, 0.01
 """Beams have changed where more than such a share of them says something else (nats), or is stopped elsewhere (m)."""
-
-LARGE = 0.75
-"""What hangs together over more than this (m) is no primitive."""
-
-TOUCHING = 0.008
-"""Cells of a wall whose centres lie within this (m) of a primitive are taken for the primitive's."""
 
 FAMILY = {
     Kind.SQUARE: BOX,
@@ -131,11 +126,6 @@ def parameters(primitive: Primitive) -> FloatArray:
     return np.array([primitive.x, primitive.y, primitive.theta or 0.0, *primitive.width_height])
 
 
-def circumradius(primitive: Primitive) -> float:
-    """How far (m) a primitive reaches from its centroid."""
-    return float(np.hypot(*primitive.local_outline(16).T).max())
-
-
 class Gatherer:
     """Collects the rays that pass each of some circles: ``centres`` (M, 2) and ``reach`` (M,) in metres."""
 
@@ -203,74 +193,6 @@ def gather(
     for scan, pose in scans:
         gatherer.add(scan, pose)
     return gatherer.beams(), gatherer.span
-
-
-@dataclass(frozen=True)
-class MapCells:
-    """A map's occupied cells (rows, cols), numbered by what hangs together (0: not occupied), and which of them
-    belong to something larger than any primitive; and its free cells.
-    """
-
-    frame: GridFrame
-    occupied: NDArray[np.bool_]
-    free: NDArray[np.bool_]
-    labels: NDArray[np.int32]
-    large: NDArray[np.bool_]
-
-    @classmethod
-    def of(cls, grid: OccupancyGrid) -> MapCells:
-        """The cells of a map: what hangs together over more than LARGE is a wall, or the like."""
-        from scipy import ndimage  # when it is needed: a replay without refinement starts faster
-
-        labels, _ = ndimage.label(grid.occupied, np.ones((3, 3)))
-        cells = LARGE / grid.frame.resolution
-        large = [
-            number
-            for number, (rows, cols) in enumerate(ndimage.find_objects(labels), start=1)
-            if max(rows.stop - rows.start, cols.stop - cols.start) > cells
-        ]
-        return cls(grid.frame, grid.occupied, grid.free, labels, np.isin(labels, large))
-
-    def without(self, primitives: Sequence[Primitive], margin: float) -> NDArray[np.bool_]:
-        """The occupied cells (rows, cols) but for those of the primitives and within ``margin`` (m) of them.
-
-        Walls stay, but for what lies in a primitive or all but touches it.
-        """
-        occupied = self.occupied.copy()
-        for primitive in primitives:
-            rows, cols, points = _cells_around(self.frame, primitive, circumradius(primitive) + margin)
-            near, touching = (is_within(primitive, points, reach) for reach in (margin, min(margin, TOUCHING)))
-            occupied[rows, cols] &= ~np.where(self.large[rows, cols], touching, near)
-        return occupied
-
-
-def _cells_around(frame: GridFrame, primitive: Primitive, reach: float) -> tuple[slice, slice, FloatArray]:
-    """The part of a grid around a primitive: its rows and columns, and its cells' centres (rows, cols, 2)."""
-
-    def span(middle: float, first: int, count: int) -> tuple[int, int]:
-        low = math.floor((middle - reach) / frame.resolution) - first
-        high = math.ceil((middle + reach) / frame.resolution) - first
-        return min(max(low, 0), count), min(max(high, 0), count)
-
-    row, last_row = span(primitive.y, frame.row, frame.rows)
-    col, last_col = span(primitive.x, frame.col, frame.cols)
-    x = (np.arange(col, last_col) + frame.col + 0.5) * frame.resolution
-    y = (np.arange(row, last_row) + frame.row + 0.5) * frame.resolution
-    return slice(row, last_row), slice(col, last_col), np.stack(np.meshgrid(x, y), axis=-1)
-
-
-def is_within(primitive: Primitive, points: NDArray[np.floating], margin: float) -> NDArray[np.bool_]:
-    """Which points (..., 2) lie in a primitive or no more than ``margin`` (m) outside of it (corners cut square)."""
-    cos, sin = math.cos(primitive.theta or 0.0), math.sin(primitive.theta or 0.0)
-    local = (points - (primitive.x, primitive.y)) @ np.array([[cos, -sin], [sin, cos]])
-    if primitive.is_round:
-        semi = np.array(primitive.width_height) + margin
-        return np.asarray(((local / semi) ** 2).sum(axis=-1) < 1)
-    corners = primitive.local_outline()
-    along = np.roll(corners, -1, axis=0) - corners
-    normals = np.column_stack((along[:, 1], -along[:, 0])) / np.hypot(*along.T)[:, None]
-    reaches = (normals * corners).sum(axis=1) + margin
-    return np.asarray((local @ normals.T < reaches).all(axis=-1))
 
 
 @dataclass(frozen=True)

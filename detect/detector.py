@@ -15,11 +15,14 @@ from numpy.typing import NDArray
 from detect.estimator import Estimator, Found
 from detect.tiles import TILE, cut, tiles, window
 from detect.weights import Weights, load_set
-from detect.yolo import KINDS, Boxes, Yolo, suppress
+from detect.yolo import KINDS, Boxes, Yolo, overlap, suppress
 from mapping.grid import GridFrame, OccupancyGrid
 from prim.errors import UsageError
 from prim.metrics import polygon_areas
 from prim.shapes import Kind, Primitive
+
+DOUBTFUL = 0.08
+"""What scores less than its kind's threshold, but this much at least, is left to the rays to judge."""
 
 FLOOR = 0.05
 """What YOLO gives a lower score than this is no candidate."""
@@ -71,10 +74,14 @@ class Rejection:
 
 @dataclass(frozen=True)
 class Detections:
-    """What was found in a map, best first, and what was not taken for a primitive."""
+    """What was found in a map, best first, and what was not taken for a primitive.
+
+    ``doubtful``: of what was rejected, what scored too little and nothing else: the rays may speak for it.
+    """
 
     found: tuple[Detection, ...]
     rejected: tuple[Rejection, ...]
+    doubtful: tuple[tuple[Detection, Rejection], ...] = ()
 
 
 @dataclass(frozen=True)
@@ -127,19 +134,26 @@ class Detector:
             [_is_whole(box, one.tile, frame) for box, one in zip(boxes.box, of, strict=True)], dtype=bool
         )
         better = _suppressed(boxes, whole & (boxes.score >= least), [len(one.boxes) for one in looked])
-        kept = np.flatnonzero(better == np.arange(len(boxes))).tolist()
-        found = [_found(of[i], boxes, i) for i in kept]
-        measured = _best_first(
-            Detection(primitive, float(boxes.score[i]), _metres(boxes, i, frame), self.estimator.crop(one))
-            for i, one, primitive in zip(kept, found, self.estimator(found), strict=True)
-        )
-        detections, overlapping = _apart(measured)
-        rejections = (
-            _rejection(boxes, i, frame, self._reason(boxes, i, by, bool(whole[i])))
+        kept = np.flatnonzero(better == np.arange(len(boxes)))
+        detections, overlapping = _apart(_best_first(self._measured(kept, boxes, of, frame)))
+        rejections = {
+            i: _rejection(boxes, i, frame, self._reason(boxes, i, by, bool(whole[i])))
             for i, by in enumerate(better.tolist())
             if by != i
-        )
-        return Detections(detections, _best_first([*overlapping, *rejections]))
+        }
+        maybe = _doubtful(boxes, whole & (better < 0), kept)
+        doubtful = zip(self._measured(maybe, boxes, of, frame), [rejections[i] for i in maybe.tolist()], strict=True)
+        return Detections(detections, _best_first([*overlapping, *rejections.values()]), tuple(doubtful))
+
+    def _measured(
+        self, chosen: NDArray[np.intp], boxes: Boxes, of: Sequence[_Looked], frame: GridFrame
+    ) -> list[Detection]:
+        """Some of the candidates with the parameters that are read from their crops."""
+        found = [_found(of[i], boxes, i) for i in chosen.tolist()]
+        return [
+            Detection(primitive, float(boxes.score[i]), _metres(boxes, i, frame), self.estimator.crop(one))
+            for i, one, primitive in zip(chosen.tolist(), found, self.estimator(found), strict=True)
+        ]
 
     def _look(self, images: Iterable[tuple[GridFrame, NDArray[np.uint8]]]) -> Iterator[_Looked]:
         """What YOLO sees in tiles, where it sees anything."""
@@ -173,6 +187,14 @@ def _suppressed(boxes: Boxes, among: NDArray[np.bool_], per_tile: Sequence[int])
     if len(per_tile) > 1:
         by[left] = left[suppress(boxes[left], OVERLAP_LIMIT)]
     return by
+
+
+def _doubtful(boxes: Boxes, among: NDArray[np.bool_], kept: NDArray[np.intp]) -> NDArray[np.intp]:
+    """Candidates that score too little, but are none of what was kept and the best of their place."""
+    among = among & (boxes.score >= DOUBTFUL)
+    for i in kept.tolist():
+        among &= overlap(boxes.box[i], boxes.box) <= OVERLAP_LIMIT
+    return np.flatnonzero(suppress(boxes, OVERLAP_LIMIT, among=among) == np.arange(len(boxes)))
 
 
 def _apart(measured: Sequence[Detection]) -> tuple[tuple[Detection, ...], list[Rejection]]:

@@ -12,7 +12,8 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from detect.beams import MapCells, is_within
+from detect.cells import MapCells, is_within
+from prim.metrics import dilate
 from prim.raycast import FloatArray
 from prim.shapes import Kind, Primitive
 
@@ -22,6 +23,9 @@ LEAST, MOST = 0.03, 0.7
 LEAST_CELLS = 6
 COVERED = 0.3
 """What lies by more than this share in a primitive that was found is a part of it."""
+
+LEAST_FREE = 0.3
+"""Around what is proposed, this share of the cells is free at least: what lies behind a wall is not seen."""
 
 NEAR = 0.03
 """A cell this near (m) to a primitive counts as in it."""
@@ -50,9 +54,23 @@ def blobs(cells: MapCells) -> Iterator[FloatArray]:
     numbers = cells.labels.ravel()[order]
     first, last = np.searchsorted(numbers, [1, cells.labels.max() + 1])
     for part in np.split(order[first:last], np.flatnonzero(np.diff(numbers[first:last])) + 1):
-        if len(part) >= LEAST_CELLS and not cells.large.flat[part[0]]:
-            rows, cols = np.divmod(part, frame.cols)
+        if len(part) < LEAST_CELLS or cells.large.flat[part[0]]:
+            continue
+        rows, cols = np.divmod(part, frame.cols)
+        if _free_around(cells, rows, cols) >= LEAST_FREE:
             yield (np.column_stack((cols + frame.col, rows + frame.row)) + 0.5) * frame.resolution
+
+
+def _free_around(cells: MapCells, rows: NDArray[np.intp], cols: NDArray[np.intp]) -> float:
+    """Of the cells around a thing (8 neighbours), the share that is free."""
+    top, left = rows.min() - 1, cols.min() - 1
+    own = np.zeros((rows.max() - top + 2, cols.max() - left + 2), np.bool_)
+    own[rows - top, cols - left] = True
+    around = dilate(own, 1) & ~own
+    at_rows, at_cols = np.nonzero(around)
+    at_rows, at_cols = at_rows + top, at_cols + left
+    inside = (at_rows >= 0) & (at_rows < cells.frame.rows) & (at_cols >= 0) & (at_cols < cells.frame.cols)
+    return float(cells.free[at_rows[inside], at_cols[inside]].sum() / len(at_rows))
 
 
 def rectangle_around(points: FloatArray, resolution: float) -> Primitive | None:

@@ -28,22 +28,21 @@ from detect.beams import (
     FAMILY,
     Backdrop,
     Beams,
-    MapCells,
     Sensor,
     backdrop,
     behind,
-    circumradius,
     explained,
     gather,
     in_table,
     parameters,
 )
+from detect.cells import MapCells, circumradius
 from detect.detector import Detection, Detections, Rejection
 from detect.evidence import exact_costs, laplace, weighed
 from detect.fit import Fit, again, primitive_of, search
 from detect.proposals import proposals
 from detect.raycost import MEASURED, MISS, RANGE, STOP, not_below, trace
-from detect.walls import walls_behind
+from detect.walls import Wall, walls_behind
 from mapping.grid import OccupancyGrid
 from prim.frames import Pose2D, Scan
 from prim.metrics import polygon_areas
@@ -65,11 +64,14 @@ LEAST_GAIN = 25.0
 MOST_MISFIT = 0.25
 """Of the rays that meet a primitive, the map explains each better by no more than this (nats) on average."""
 
-LEAST_SEEN = 0.55
-"""What the networks did not find must be seen from so many sides: this share of its outline's directions."""
+LEAST_SEEN = 0.4
+"""What the networks did not find, or hardly, must be seen in this share of the directions around it."""
 
 LEAST_SURE = 0.5
 """And its kind must be at least as sure as this."""
+
+LEAST_SHARED = 0.5
+"""And it shares this much of the smaller area with what it was first taken for."""
 
 SECTORS = 24
 """Directions around a primitive's centroid, in which its outline is seen or not."""
@@ -129,8 +131,9 @@ class Candidate:
 
     start: Primitive
     beams: Beams
+    cells: MapCells
     map_behind: Backdrop | None = None
-    walls: list[Primitive] = field(default_factory=list)
+    walls: list[Wall] = field(default_factory=list)
     fits: list[Fit] = field(default_factory=list)
     fitted_to: tuple[Sensor, Beams] | None = None
 
@@ -139,6 +142,10 @@ class Candidate:
         self.beams = self.beams.of(chosen)
         self.map_behind = self.map_behind and self.map_behind.of(chosen)
         self.fitted_to = self.fitted_to and (self.fitted_to[0], self.fitted_to[1].of(chosen))
+
+    def may_be(self, primitive: Primitive) -> bool:
+        """Whether a primitive keeps off the walls behind it."""
+        return not self.cells.is_pierced_by(primitive) and not any(wall.is_cut_by(primitive) for wall in self.walls)
 
     @property
     def now(self) -> Primitive:
@@ -159,32 +166,35 @@ def refine_detections(
     do not with the reasons, and the noise; None where no ray passes anything.
     """
     cells = MapCells.of(grid)
-    guesses = [one.primitive for one in detections.found]
-    added = proposals(cells, guesses)
-    refined, found_std = refine([*guesses, *added], scans, cells, noise_std, threads)
+    unsure = [one for one, _ in detections.doubtful]
+    guesses = [one.primitive for one in (*detections.found, *unsure)]
+    added = [_proposed(one) for one in proposals(cells, guesses)]
+    wanted = (*detections.found, *unsure, *added)
+    refined, found_std = refine([one.primitive for one in wanted], scans, cells, noise_std, threads)
     kept: list[Detection] = []
-    rejected = list(detections.rejected)
-    for guess, made in zip(detections.found, refined, strict=False):
-        reason = contradiction(made)
+    rejected = []
+    for number, (guess, made) in enumerate(zip(wanted, refined, strict=True)):
+        reason = contradiction(made) if number < len(detections.found) else doubt(made, guess.primitive, cells)
         if made is None or reason:
-            rejected.append(_rejected(guess.primitive, guess.score, reason))
+            rejected.append(_rejected(guess, reason))
         else:
             kept.append(_detection(made, guess.crop))
-    for start, made in zip(added, refined[len(guesses) :], strict=True):
-        reason = contradiction(made) or (doubt(made) if made is not None else "")
-        if made is None or reason:
-            rejected.append(_rejected(start, made.score if made else 0.0, f"not found by the networks; {reason}"))
-        else:
-            kept.append(_detection(made, np.zeros((0, 0), np.uint8)))
+    judged = {id(rejection) for _, rejection in detections.doubtful}
+    rejected += [one for one in detections.rejected if id(one) not in judged]
     kept.sort(key=lambda one: -one.score)
     rejected.sort(key=lambda one: -one.score)
     return Detections(tuple(kept), tuple(rejected)), found_std
 
 
+def _proposed(primitive: Primitive) -> Detection:
+    """Something in the map that the networks did not see: without score, box and crop."""
+    return Detection(primitive, 0.0, (0.0, 0.0, 0.0, 0.0), np.zeros((0, 0), np.uint8))
+
+
 def contradiction(made: Refined | None) -> str:
     """Why the rays speak against a primitive; nothing where they do not."""
     if made is None:
-        return "no ray passes it, a likelier one stands in its place, or it is larger than primitives are"
+        return "no ray passes it, a likelier one stands in its place, or it is too large or reaches into a wall"
     if made.gain < LEAST_GAIN:
         return f"the rays are likelier with it by {made.gain:.0f} nats only, less than {LEAST_GAIN:g}"
     if made.misfit > MOST_MISFIT:
@@ -192,17 +202,25 @@ def contradiction(made: Refined | None) -> str:
     return ""
 
 
-def doubt(made: Refined) -> str:
-    """Why something that the networks did not find is not taken for a primitive; nothing where it is."""
+def doubt(made: Refined | None, guess: Primitive, cells: MapCells) -> str:
+    """Why something that the networks did not find, or were not sure of, is no detection; nothing where it is."""
+    before = "not found, or hardly, by the networks; "
+    reason = contradiction(made)
+    if made is None or reason:
+        return before + reason
     if made.seen < LEAST_SEEN:
-        return f"only {made.seen:.0%} of its outline is seen, less than {LEAST_SEEN:.0%}"
+        return f"{before}only {made.seen:.0%} of its outline is seen, less than {LEAST_SEEN:.0%}"
+    if cells.is_touched_by(made.primitive):
+        return f"{before}it reaches into a wall"
+    if _share(made.primitive, guess) < LEAST_SHARED:
+        return f"{before}what explains its rays stands elsewhere"
     if made.score < LEAST_SURE:
-        return f"its kind is sure by {made.score:.2f} only, less than {LEAST_SURE:g}"
+        return f"{before}its kind is sure by {made.score:.2f} only, less than {LEAST_SURE:g}"
     return ""
 
 
-def _rejected(primitive: Primitive, score: float, reason: str) -> Rejection:
-    return Rejection(primitive.kind, score, primitive.x, primitive.y, reason)
+def _rejected(guess: Detection, reason: str) -> Rejection:
+    return Rejection(guess.primitive.kind, guess.score, guess.primitive.x, guess.primitive.y, reason)
 
 
 def _detection(made: Refined, crop: NDArray[np.uint8]) -> Detection:
@@ -226,7 +244,7 @@ def refine(
     if not primitives:
         return [], noise_std
     around, span = gather(scans, primitives, REACH)
-    candidates = [Candidate(start, beams) for start, beams in zip(primitives, around, strict=True)]
+    candidates = [Candidate(start, beams, cells) for start, beams in zip(primitives, around, strict=True)]
     seen = [one for one in candidates if len(one.beams)]
     if not seen:
         return [None] * len(primitives), noise_std
@@ -267,7 +285,8 @@ def _fit_one(candidate: Candidate, beams: Beams, sensor: Sensor, anew: bool) -> 
         return
     else:
         fits = again(candidate.fits, beams, sensor)
-    candidate.fits = sorted(fits, key=lambda fit: -laplace(fit))
+    possible = [fit for fit in fits if candidate.may_be(primitive_of(fit.kind, fit.p))]
+    candidate.fits = sorted(possible or fits, key=lambda fit: -laplace(fit))
     candidate.fitted_to = sensor, beams
 
 
@@ -278,14 +297,14 @@ def look_behind(candidates: Sequence[Candidate], cells: MapCells, margin: float)
     """
     shapes = [one.now for one in candidates]
     occupied = cells.without(shapes, margin)
-    walls = walls_behind(cells, shapes)
+    walls = walls_behind(cells, shapes, [one.beams.rays[:, :2].mean(axis=0) for one in candidates])
     for wall in walls:
         occupied &= ~wall.cells
     changed = []
     for one in candidates:
         before = one.map_behind
         one.map_behind = backdrop(one.beams, occupied, cells.frame)
-        one.walls = [wall.stretch for wall in walls]
+        one.walls = walls
         moved = before is None or np.mean(np.abs(before.stops - one.map_behind.stops) > MOVED) > MOVED_SHARE
         changed.append(bool(moved))
     return changed
@@ -399,7 +418,9 @@ def before_others(candidate: Candidate, among: Sequence[Candidate], sensor: Sens
     """A candidate's beams, with what they say where they miss it."""
     others = [one.now for one in among if one is not candidate]
     assert candidate.map_behind is not None
-    return behind(candidate.beams, candidate.map_behind, [*others, *candidate.walls], sensor)
+    return behind(
+        candidate.beams, candidate.map_behind, [*others, *(wall.stretch for wall in candidate.walls)], sensor
+    )
 
 
 def _once(candidates: Sequence[Candidate], sensor: Sensor) -> list[Candidate]:
@@ -431,7 +452,7 @@ def finish(candidate: Candidate, map_alone: Backdrop, sensor: Sensor) -> Refined
     assert candidate.fitted_to is not None
     beams = candidate.fitted_to[1]
     told = weighed(candidate.fits, beams, sensor)
-    if told is None:
+    if told is None or not candidate.may_be(told.primitive):
         return None
     gain = float(-beams.rays[:, MISS].sum() - told.cost)
     misfit, rays, seen = _held_against_map(told.primitive, beams, map_alone, sensor)

@@ -12,7 +12,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from detect.beams import MapCells, circumradius, is_within
+from detect.cells import MapCells, beside_free, centres, circumradius, is_within
+from detect.lines import Line, find_lines
 from mapping.grid import GridFrame
 from prim.metrics import BoolGrid
 from prim.raycast import FloatArray
@@ -27,75 +28,58 @@ AROUND = 0.5
 LEAST_LENGTH = 0.12
 """So much (m) of a wall must be seen at both sides."""
 
-THICKNESS = 0.002
-TRIALS = 60
+DEPTH = 0.02
+"""How far (m) a primitive may reach into a wall: the wall's line is no surer."""
 
-Line = tuple[float, float, float]
-"""nx, ny, d: points with nx x + ny y = d; the normal points to the free side."""
+THICKNESS = 0.002
 
 
 @dataclass(frozen=True)
 class Wall:
-    """A stretch of a wall behind a candidate, and the map's cells that stand for it there (rows, cols)."""
+    """A stretch of a wall behind a candidate, the line it lies on (its normal points to where it is seen from), and
+    the map's cells that stand for it there (rows, cols).
+    """
 
     stretch: Primitive
+    line: Line
     cells: BoolGrid
 
+    def is_cut_by(self, primitive: Primitive) -> bool:
+        """Whether a primitive reaches behind the stretch by more than DEPTH: nothing does."""
+        nx, ny, d = self.line
+        outline = primitive.outline(32)
+        along = (outline - (self.stretch.x, self.stretch.y)) @ np.array([-ny, nx])
+        behind = d - outline @ np.array([nx, ny])
+        return bool((behind[np.abs(along) < self.stretch.size[0] / 2] > DEPTH).any())
 
-def walls_behind(cells: MapCells, candidates: Sequence[Primitive]) -> list[Wall]:
-    """The walls that candidates stand close to, and that come out straight on both sides of each."""
-    surface = cells.large & _touches_free(cells)
-    rows, cols = np.nonzero(surface)
-    points = (np.column_stack((cols + cells.frame.col, rows + cells.frame.row)) + 0.5) * cells.frame.resolution
-    close = [one for one in candidates if is_within(one, points, CLOSE).any()]
+
+def walls_behind(cells: MapCells, candidates: Sequence[Primitive], eyes: Sequence[FloatArray]) -> list[Wall]:
+    """The walls that candidates stand close to, and that come out straight on both sides of each.
+
+    ``eyes`` (2,): for each candidate the middle (m) of where it is seen from.
+    """
+    points = centres(cells.large & beside_free(cells.free), cells.frame)
+    close = [is_within(one, points, CLOSE).any() for one in candidates]
     for one in candidates:
         points = points[~is_within(one, points, 0.04)]
     made = []
-    for one in close:
+    for one, eye, is_close in zip(candidates, eyes, close, strict=True):
+        if not is_close:
+            continue
         near = points[np.hypot(*(points - (one.x, one.y)).T) < circumradius(one) + AROUND]
-        for line in _lines(near, cells.frame.resolution):
-            wall = _stretch(cells, one, line, near)
+        for nx, ny, d in find_lines(near, cells.frame.resolution, 2 * LEAST_LENGTH, 2):
+            side = 1.0 if nx * eye[0] + ny * eye[1] > d else -1.0
+            wall = _stretch(cells, one, (side * nx, side * ny, side * d), near)
             if wall is not None:
                 made.append(wall)
     return made
 
 
-def _touches_free(cells: MapCells) -> BoolGrid:
-    """Cells with a neighbour (4) that is free."""
-    free = np.pad(cells.free, 1)
-    return free[:-2, 1:-1] | free[2:, 1:-1] | free[1:-1, :-2] | free[1:-1, 2:]
-
-
-def _lines(points: FloatArray, resolution: float) -> list[Line]:
-    """Up to two straight lines through many of the points, the best first."""
-    rng = np.random.default_rng(0)
-    found: list[Line] = []
-    while len(found) < 2 and len(points) * resolution > 2 * LEAST_LENGTH:
-        best = np.zeros(len(points), np.bool_)
-        for first, second in rng.integers(len(points), size=(TRIALS, 2)):
-            along = points[second] - points[first]
-            length = math.hypot(*along)
-            if length < LEAST_LENGTH:
-                continue
-            off = np.abs((points - points[first]) @ np.array([-along[1], along[0]])) / length
-            if np.count_nonzero(off < resolution) > np.count_nonzero(best):
-                best = off < resolution
-        if np.count_nonzero(best) * resolution < 2 * LEAST_LENGTH:
-            break
-        middle = points[best].mean(axis=0)
-        normal = np.linalg.eigh(np.cov((points[best] - middle).T))[1][:, 0]
-        found.append((float(normal[0]), float(normal[1]), float(normal @ middle)))
-        points = points[np.abs(points @ normal - normal @ middle) > 3 * resolution]
-    return found
-
-
 def _stretch(cells: MapCells, candidate: Primitive, line: Line, points: FloatArray) -> Wall | None:
-    """The stretch of a line behind a candidate; None where the candidate is not close to it, or cuts it."""
+    """The stretch of a line behind a candidate; None where the candidate is not close to it."""
     nx, ny, d = line
-    outline = candidate.outline(32) @ np.array([nx, ny]) - d
-    side = 1.0 if outline.mean() > 0 else -1.0
-    gap = float((side * outline).min())
-    if not -0.02 < gap < CLOSE:
+    gap = float((candidate.outline(32) @ np.array([nx, ny]) - d).min())
+    if gap > CLOSE:
         return None
     on_line = points[np.abs(points @ np.array([nx, ny]) - d) < 1.5 * cells.frame.resolution]
     along = on_line @ np.array([-ny, nx])
@@ -111,13 +95,13 @@ def _stretch(cells: MapCells, candidate: Primitive, line: Line, points: FloatArr
     stretch = Primitive(
         Kind.RECTANGLE, nx * d - ny * at, ny * d + nx * at, theta, (high - low, THICKNESS)
     ).canonical()
-    return Wall(stretch, _cells_of(cells.frame, cells.large, stretch))
+    return Wall(stretch, line, _cells_of(cells.frame, cells.large, stretch))
 
 
 def _cells_of(frame: GridFrame, large: BoolGrid, stretch: Primitive) -> BoolGrid:
     """The large cells (rows, cols) that stand for a stretch of a wall: within three and a half cells of it."""
     rows, cols = np.nonzero(large)
-    points = (np.column_stack((cols + frame.col, rows + frame.row)) + 0.5) * frame.resolution
+    points = centres(large, frame)
     inside = is_within(stretch, points, 3.5 * frame.resolution)
     found = np.zeros_like(large)
     found[rows[inside], cols[inside]] = True
