@@ -18,8 +18,8 @@ from prim.shapes import Primitive
 LARGE = 0.75
 """What hangs together over more than this (m) is no primitive."""
 
-LEAST_WALL = 0.5
-"""A straight line through this much (m) of such a thing's surface is a wall."""
+LEAST_WALL = 0.8
+"""A straight line through this much (m) of what is occupied and next to something free is a wall."""
 
 WALL_CELLS = 3.0
 """Cells this near (cells) to a wall's line are the wall's: noise makes it thick."""
@@ -27,7 +27,7 @@ WALL_CELLS = 3.0
 THICK, ONE_SIDED = 0.4, 0.2
 """Where one side of a wall has so much less that is free than the other, the wall goes on into it for so much (m)."""
 
-PIERCED = 0.03
+PIERCED = 0.025
 """What reaches further (m) behind a wall is no primitive."""
 
 MOST_WALLS = 16
@@ -74,8 +74,7 @@ class MapCells:
 
         What hangs on a straight wall is told apart from it: it may be a primitive that stands close to it.
         """
-        _, large = _connected(grid.occupied, grid.frame)
-        walls, one_sided = _along_lines(large, grid)
+        walls, one_sided = _along_lines(grid)
         labels, loose = _connected(grid.occupied & ~walls, grid.frame)
         return cls(grid.frame, grid.occupied, grid.free, labels, walls | loose, tuple(one_sided))
 
@@ -87,7 +86,7 @@ class MapCells:
     def is_touched_by(self, primitive: Primitive) -> bool:
         """Whether it reaches at all behind such a wall, or behind where the wall would go on to."""
         outline = primitive.outline(32)
-        return any(wall.hides(outline, TOUCHING, THICK) for wall in self.walls)
+        return any(wall.hides(outline, PIERCED, THICK) for wall in self.walls)
 
     def without(self, primitives: Sequence[Primitive], margin: float) -> NDArray[np.bool_]:
         """The occupied cells (rows, cols) but for those of the primitives and within ``margin`` (m) of them.
@@ -131,12 +130,12 @@ def _connected(occupied: BoolGrid, frame: GridFrame) -> tuple[NDArray[np.int32],
     return labels, np.isin(labels, large)
 
 
-def _along_lines(large: BoolGrid, grid: OccupancyGrid) -> tuple[BoolGrid, list[OneSided]]:
-    """Which cells of large things lie along straight walls, and which of the walls are free on one side only."""
+def _along_lines(grid: OccupancyGrid) -> tuple[BoolGrid, list[OneSided]]:
+    """Which occupied cells lie along straight walls, and which of the walls are free on one side only."""
     resolution = grid.frame.resolution
-    surface = centres(large & beside_free(grid.free), grid.frame)
-    rows, cols = np.nonzero(large)
-    points = centres(large, grid.frame)
+    surface = centres(grid.occupied & beside_free(grid.free), grid.frame)
+    rows, cols = np.nonzero(grid.occupied)
+    points = centres(grid.occupied, grid.frame)
     free = centres(grid.free, grid.frame)
     near = np.zeros(len(points), np.bool_)
     one_sided = []
@@ -144,13 +143,15 @@ def _along_lines(large: BoolGrid, grid: OccupancyGrid) -> tuple[BoolGrid, list[O
         nx, ny, d = line
         on_it = surface[np.abs(surface @ np.array([nx, ny]) - d) < resolution]
         side = _free_side(line, on_it, free, resolution)
-        off = points @ np.array([nx, ny]) - d
+        off, along = points @ np.array([nx, ny]) - d, points @ np.array([-ny, nx])
+        ends = on_it @ np.array([-ny, nx])
         thin = WALL_CELLS * resolution
-        near |= (off > (-THICK if side > 0 else -thin)) & (off < (THICK if side < 0 else thin))
+        beside = (along > ends.min() - thin) & (along < ends.max() + thin)
+        near |= beside & (off > (-THICK if side > 0 else -thin)) & (off < (THICK if side < 0 else thin))
         if side:
-            along = on_it @ np.array([-side * ny, side * nx])
-            one_sided.append(OneSided((side * nx, side * ny, side * d), float(along.min()), float(along.max())))
-    walls = np.zeros_like(large)
+            first, last = sorted((side * float(ends.min()), side * float(ends.max())))
+            one_sided.append(OneSided((side * nx, side * ny, side * d), first, last))
+    walls = np.zeros_like(grid.occupied)
     walls[rows[near], cols[near]] = True
     return walls, one_sided
 

@@ -149,6 +149,20 @@ def extreme(family: int, mx: float, my: float) -> tuple[float, float]:
 
 
 @inline
+def slide(sign: float, ax: float, ay: float, bx: float, by: float, width: float, height: float, dr: Any) -> None:
+    """How the distance to an ellipse's silhouette changes with its angle and axes: its point slides on the outline.
+
+    (ax, ay) is the ray's normal and (bx, by) its direction in the ellipse's own frame; ``sign`` tells the side.
+    """
+    reach = math.sqrt((width * ax) ** 2 + (height * ay) ** 2)
+    along = width * width * ax * bx + height * height * ay * by
+    unlike = width * width - height * height
+    dr[THETA] = sign * (unlike * (ay * bx + ax * by) / reach - along * unlike * ax * ay / reach**3)
+    dr[WIDTH] = sign * (2 * width * ax * bx / reach - along * width * ax * ax / reach**3)
+    dr[HEIGHT] = sign * (2 * height * ay * by / reach - along * height * ay * ay / reach**3)
+
+
+@inline
 def told_by(
     family: int, p: Any, cos: float, sin: float, beam: Any, blur: float, dr: Any, ds: Any
 ) -> tuple[float, float]:
@@ -189,6 +203,8 @@ def told_by(
         dr[X], dr[Y] = dx, dy
         dr[THETA] = dy * px - dx * py
         dr[WIDTH], dr[HEIGHT] = bx * qx, by * qy
+        if family == DISC:
+            slide(sign, ax, ay, bx, by, width, height, dr)
         return (px - ox) * dx + (py - oy) * dy, s
     hx, hy = lx + t * ux, ly + t * uy
     scale = 1.0 / (gx * ux + gy * uy)

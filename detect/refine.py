@@ -64,14 +64,17 @@ LEAST_GAIN = 25.0
 MOST_MISFIT = 0.25
 """Of the rays that meet a primitive, the map explains each better by no more than this (nats) on average."""
 
-LEAST_SEEN = 0.4
+LEAST_SEEN = 0.35
 """What the networks did not find, or hardly, must be seen in this share of the directions around it."""
 
 LEAST_SURE = 0.5
 """And its kind must be at least as sure as this."""
 
-LEAST_SHARED = 0.5
+LEAST_SHARED = 0.25
 """And it shares this much of the smaller area with what it was first taken for."""
+
+MOST_SPREAD = 0.2
+"""And its sizes are known to within this share of them (one standard deviation)."""
 
 SECTORS = 24
 """Directions around a primitive's centroid, in which its outline is seen or not."""
@@ -214,6 +217,8 @@ def doubt(made: Refined | None, guess: Primitive, cells: MapCells) -> str:
         return f"{before}it reaches into a wall"
     if _share(made.primitive, guess) < LEAST_SHARED:
         return f"{before}what explains its rays stands elsewhere"
+    if any(made.std[name] > MOST_SPREAD * size for name, size in made.primitive.sizes.items()):
+        return f"{before}its sizes are not known to within {MOST_SPREAD:.0%}"
     if made.score < LEAST_SURE:
         return f"{before}its kind is sure by {made.score:.2f} only, less than {LEAST_SURE:g}"
     return ""
@@ -255,6 +260,9 @@ def refine(
         alone = _once(seen, sensor)
         for one in alone:
             one.look_at(one.beams.passing(one.now, REACH_FITTED))
+        alone = [one for one in alone if len(one.beams)]
+        if not alone:
+            return [None] * len(primitives), noise_std
         sensor = Sensor.of(noise_std or measured_noise(alone, sensor), span)
         for _ in range(ROUNDS):
             changed = look_behind(alone, cells, CLEARED)

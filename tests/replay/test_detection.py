@@ -50,7 +50,7 @@ def knowing(noisy_session: Session, monkeypatch: pytest.MonkeyPatch) -> Knowing:
 
 
 def replayed(session: Session, viewer: RerunViewer | None = None, **options: object) -> ReplayResult:
-    chosen = ReplayOptions(weights=Path("w"), **options)  # type: ignore[arg-type]
+    chosen = ReplayOptions(weights=Path("w"), **{"refine": False} | options)  # type: ignore[arg-type]
     return Pipeline(session.path, chosen, viewer).run()
 
 
@@ -68,6 +68,33 @@ def test_the_report_lists_what_was_found(noisy_session: Session, knowing: Knowin
     assert {pair["truth"]: pair["id"] for pair in errors["pairs"]} == {k: k + 1 for k in range(len(truth))}
     assert told["timing"]["detect_s"] > 0
     assert len(knowing.seen) == 1
+
+
+@pytest.mark.parametrize("mapper", MAPPERS)
+def test_what_was_found_is_refined_by_the_rays(noisy_session: Session, knowing: Knowing, mapper: str) -> None:
+    """The detector is 10 mm off; the rays are not, though their noise is 50 mm."""
+    told = report(replayed(noisy_session, mapper=mapper, refine=True))
+    assert json.loads(json.dumps(told)) == told
+    assert told["errors"]["f1"] > 0.7  # two of seven cannot be told from a circle and a square in so few rays
+    assert told["errors"]["position_m"] < 0.004
+    for one in told["primitives"]:
+        assert one["stage"] == "refined" and 0 < one["score"] <= 1
+        assert set(one["std"]) == {"x", "y", *one["size"], *(["theta"] if one["theta"] is not None else [])}
+        assert all(0 < value < 0.3 for value in one["std"].values())
+        assert one["chances"][one["kind"]] == one["score"] == max(one["chances"].values())
+    assert told["refine"]["noise_std_m"] == pytest.approx(0.05, rel=0.15)
+    assert told["timing"]["refine_s"] > 0
+
+
+def test_refinement_on_the_way_is_on_the_timeline(noisy_session: Session, knowing: Knowing, tmp_path: Path) -> None:
+    viewer = RerunViewer(ViewerOptions(save=tmp_path / "a.rrd"), announce=print)
+    replayed(noisy_session, viewer, mapper="forward", detect_every=10, refine=True)
+    rows = rows_of(tmp_path / "a.rrd")
+    lengths = [value(row, "scalars")[0] for row in timed(rows["/errors/lengths"])]
+    assert lengths[-1] < 4.0  # mm
+    bands = timed(rows["/map/uncertainty"])
+    assert len(bands) == len(lengths)
+    assert len(value(bands[-1], "strips")) == 2 * len(value(timed(rows["/map/detections"])[-1], "strips"))
 
 
 def test_no_detection_where_none_is_wanted(noisy_session: Session, knowing: Knowing) -> None:
@@ -106,7 +133,7 @@ def test_the_detector_keeps_a_map_of_its_own(noisy_session: Session, knowing: Kn
 def test_rejected_candidates_are_told_at_verbose(
     noisy_session: Session, knowing: Knowing, in_tmp: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    command = [str(noisy_session.path), "--weights", "w", "--no-viewer", "--verbose"]
+    command = [str(noisy_session.path), "--weights", "w", "--no-refine", "--no-viewer", "--verbose"]
     assert console.run(cli.app, "prim-replay", command) == 0
     seen = capsys.readouterr()
     wanted = "rejected: circle at (0.50, 0.25) m, score 0.10: score 0.10 is below 0.30, the least for a circle"
@@ -119,6 +146,7 @@ def test_rejected_candidates_are_told_at_verbose(
     [
         ({"detect": False, "detect_every": 3}, "--no-detect excludes"),
         ({"detect": False, "weights": Path("w")}, "--no-detect excludes"),
+        ({"detect": False, "refine": False}, "--no-detect excludes"),
         ({"detect_every": 0}, "--detect-every is 0"),
     ],
 )
