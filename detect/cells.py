@@ -83,6 +83,11 @@ class MapCells:
         outline = primitive.outline(32)
         return any(wall.hides(outline, PIERCED, 0.0) for wall in self.walls)
 
+    def hide(self, primitive: Primitive) -> bool:
+        """Whether a primitive's middle lies behind such a wall, or behind where the wall would go on to."""
+        middle = np.array([[primitive.x, primitive.y]])
+        return any(wall.hides(middle, 0.0, THICK) for wall in self.walls)
+
     def is_touched_by(self, primitive: Primitive) -> bool:
         """Whether it reaches at all behind such a wall, or behind where the wall would go on to."""
         outline = primitive.outline(32)

@@ -13,7 +13,9 @@ from detect.raycost import PARAMETERS, costs, descend
 from prim.raycast import FloatArray
 from prim.shapes import SIZE_KEYS, Kind, Primitive
 
-COARSE_RAYS = 800
+COARSE_RAYS, SEARCH_RAYS = 800, 1600
+"""To about so many rays starts are fitted, and what comes of the best of them."""
+
 COARSE_BLURS = (0.03, 0.012)
 FINE_BLURS = (0.008, 0.001)
 """Fits go from one blur (m, half a footprint) to the next; the last is no smaller than the sensor's own."""
@@ -107,7 +109,7 @@ def search(now: Primitive, beams: Beams, sensor: Sensor) -> list[Fit]:
     """Every kind that may explain what was taken for a primitive, fitted to its beams.
 
     Starts are fitted to some of the rays, and held against all of them, beside what it was taken for ``now``; from
-    the best of each kind the fit goes on with all rays.
+    the best of each kind the fit goes on with more rays.
     """
     step = max(1, len(beams) // COARSE_RAYS)
     tried = {kind: [_coarse(kind, p, beams, sensor, step).p for p in starts(now, kind)] for kind in Kind}
@@ -116,11 +118,13 @@ def search(now: Primitive, beams: Beams, sensor: Sensor) -> list[Fit]:
     limit = min(ways[0][0] for ways in ranked.values()) + HOPELESS
     hopeful = {kind for kind, ways in ranked.items() if ways[0][0] < limit}
     hopeful |= {simple for kind, simple in SIMPLER.items() if kind in hopeful}
-    return [
-        _fine(kind, [p for cost, p in ranked[kind] if cost < ranked[kind][0][0] + HOPELESS_WAY][:WAYS], beams, sensor)
-        for kind in Kind
-        if kind in hopeful
-    ]
+    step = max(1, len(beams) // SEARCH_RAYS)
+    return [_fine(kind, _best_ways(ranked[kind]), beams, sensor, step) for kind in Kind if kind in hopeful]
+
+
+def _best_ways(ranked: Sequence[tuple[float, FloatArray]]) -> list[FloatArray]:
+    """Those of a kind's coarse fits that are gone on with."""
+    return [p for cost, p in ranked if cost < ranked[0][0] + HOPELESS_WAY][:WAYS]
 
 
 def _coarse(kind: Kind, p: FloatArray, beams: Beams, sensor: Sensor, step: int) -> Fit:
@@ -140,12 +144,12 @@ def again(fits: Sequence[Fit], beams: Beams, sensor: Sensor) -> list[Fit]:
     return [_fine(fit.kind, [fit.p], beams, sensor) for fit in fits]
 
 
-def _fine(kind: Kind, ways: Sequence[FloatArray], beams: Beams, sensor: Sensor) -> Fit:
-    """The best fit to all beams from some ``ways``; a triangle's also with the other two corners as its apex."""
-    best = min((_fit(kind, p, beams, sensor, FINE_BLURS, FINE_STEPS) for p in ways), key=lambda fit: fit.cost)
+def _fine(kind: Kind, ways: Sequence[FloatArray], beams: Beams, sensor: Sensor, step: int = 1) -> Fit:
+    """The best fit from some ``ways``; a triangle's also with the other two corners as its apex."""
+    best = min((_fit(kind, p, beams, sensor, FINE_BLURS, FINE_STEPS, step) for p in ways), key=lambda fit: fit.cost)
     if kind is not Kind.TRIANGLE:
         return best
-    others = [_fit(kind, p, beams, sensor, FINE_BLURS, FINE_STEPS) for p in other_apexes(best.p)]
+    others = [_fit(kind, p, beams, sensor, FINE_BLURS, FINE_STEPS, step) for p in other_apexes(best.p)]
     return min([best, *others], key=lambda fit: fit.cost)
 
 

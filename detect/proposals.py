@@ -41,7 +41,8 @@ def proposals(cells: MapCells, found: Sequence[Primitive]) -> list[Primitive]:
         inside = np.zeros(len(points), np.bool_)
         for one in found:
             inside |= is_within(one, points, NEAR)
-        if inside.mean() <= COVERED and (around := rectangle_around(points, cells.frame.resolution)):
+        around = rectangle_around(points, cells.frame.resolution)
+        if inside.mean() <= COVERED and around is not None and not cells.hide(around):
             made.append((len(points), around))
     made.sort(key=lambda one: -one[0])
     return [around for _, around in made[:MOST_PROPOSALS]]

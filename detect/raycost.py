@@ -87,15 +87,6 @@ def looked_up(table: Any, row: int, x: float) -> float:
 
 
 @inline
-def edge_of(family: int, edge: int) -> tuple[float, float, float]:
-    """One edge of the unit box or triangle: its outward normal, and its distance from the centroid."""
-    if family == TRIANGLE:
-        return EDGE_X[edge], EDGE_Y[edge], EDGE_AT[edge]
-    side = 1.0 if edge % 2 == 0 else -1.0
-    return (side, 0.0, 0.5) if edge < 2 else (0.0, side, 0.5)
-
-
-@inline
 def entry(family: int, lx: float, ly: float, ux: float, uy: float) -> tuple[float, float, float]:
     """Where the line l + t u enters a unit shape: t (below 0 from inside), and the outward normal there.
 
@@ -113,20 +104,25 @@ def entry(family: int, lx: float, ly: float, ux: float, uy: float) -> tuple[floa
         t = (-half - root) / square
         return t, lx + t * ux, ly + t * uy
     leave = FAR
-    for edge in range(4 if family == BOX else 3):
-        ex, ey, at = edge_of(family, edge)
-        towards = ex * ux + ey * uy
-        gap = at - ex * lx - ey * ly
-        if towards == 0.0:
-            if gap < 0:
-                return FAR, 0.0, 0.0
-            continue
-        crossing = gap / towards
-        if towards < 0:
-            if crossing > t:
-                t, nx, ny = crossing, ex, ey
-        elif crossing < leave:
-            leave = crossing
+    if family == BOX:
+        along, across = 1.0 / ux, 1.0 / uy
+        near_x, far_x = -0.5 * abs(along) - lx * along, 0.5 * abs(along) - lx * along
+        near_y, far_y = -0.5 * abs(across) - ly * across, 0.5 * abs(across) - ly * across
+        leave = min(far_x, far_y)
+        if near_x > near_y:
+            t, nx = near_x, (-1.0 if ux > 0 else 1.0)
+        else:
+            t, ny = near_y, (-1.0 if uy > 0 else 1.0)
+    else:
+        for edge in range(3):
+            ex, ey = EDGE_X[edge], EDGE_Y[edge]
+            towards = ex * ux + ey * uy
+            crossing = (EDGE_AT[edge] - ex * lx - ey * ly) / towards
+            if towards < 0:
+                if crossing > t:
+                    t, nx, ny = crossing, ex, ey
+            elif crossing < leave:
+                leave = crossing
     if t > leave:
         return FAR, 0.0, 0.0
     if leave < 0:

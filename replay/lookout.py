@@ -19,6 +19,9 @@ if TYPE_CHECKING:
     from detect.detector import Detections, Detector
     from detect.tracks import Tracker
 
+SCANS_ON_THE_WAY = 60
+"""A look on the way is refined by about so many of the scans, evenly spread."""
+
 SHIPPED = Path(__file__).parents[1] / "detect" / "shipped"
 """The weights that come with prim: a folder for each mapper."""
 
@@ -69,6 +72,8 @@ class Lookout:
         self._truth = truth
         self._noise_std = noise_std
         self._scans: list[tuple[Scan, Pose2D]] = []
+        self._before: Detections | None = None
+        self._searched_at = 0
         self.refines = refines
 
     def keep(self, scan: Scan, pose: Pose2D) -> None:
@@ -98,10 +103,23 @@ class Lookout:
     def refine(
         self, detections: Detections, grid: OccupancyGrid, scans: Iterable[tuple[Scan, Pose2D]] | None = None
     ) -> tuple[Detections, float | None]:
-        """Detections fitted to the rays of all ``scans``, or of those so far; and the noise (m) of these rays."""
+        """Detections fitted to the rays of all ``scans``, or of those so far; and the noise (m) of these rays.
+
+        On the way some of the scans do, and what was sure of its kind at the last look is asked for it again only
+        when there are twice as many scans as when it was asked last.
+        """
         from detect.refine import refine_detections  # when it is needed: a replay without it starts faster
 
-        return refine_detections(detections, self._scans if scans is None else scans, grid, self._noise_std, cores())
+        if scans is not None:
+            return refine_detections(detections, scans, grid, self._noise_std, cores())
+        some = self._scans[:: max(1, len(self._scans) // SCANS_ON_THE_WAY)]
+        anew = len(self._scans) >= 2 * self._searched_at
+        if anew:
+            self._searched_at = len(self._scans)
+        before = None if anew else self._before
+        refined, noise_std = refine_detections(detections, some, grid, self._noise_std, cores(), before)
+        self._before = refined
+        return refined, noise_std
 
     def sighting(self, detections: Detections, stamp: int, noise_std: float | None = None) -> Sighting:
         """Detections with their identities, held against the truth at ``stamp`` (ns) where there is one."""
