@@ -56,7 +56,7 @@ def bounds(
     noise_std: float,
 ) -> list[Limits]:
     """The bounds of each primitive."""
-    around, _ = gather(scans, primitives, REACH)
+    around, _, _ = gather(scans, primitives, REACH)
     made = []
     for k, (one, beams) in enumerate(zip(primitives, around, strict=True)):
         near = beams.of(beams.passing(one, REACH))

@@ -1,9 +1,11 @@
 """Refinement on recorded sessions, from real detections: errors, error bars, the limit, kinds, time, and peers.
 
     python -m bench.refine [--sessions 200] [--mapper forward] [--noise 0.05 0.25 0.5] [--update docs/refine.md]
+    python -m bench.refine --conditions [--sessions 40] ...       # driven, without walls, 180 and 1000 rays
 
 Sessions that no network was trained on (seeds from 40000), 2 x 2 m, warped, 500 rays, poses exact. All that is found
-counts, no outlier is left out. Peers: OpenCV's contours on the same maps (bench/classical.py), and least squares on
+counts, no outlier is left out. mAP is of the boxes around refined outlines, by their scores. Peers: OpenCV's contours
+on the same maps (bench/classical.py), and least squares on
 the end points within 10 cm of each true outline, of the true kind: circles (RANSAC, then least squares) and
 rectangles (the box of least area around them, ends cut by 2 %). OpenCV comes with the extra [train].
 """
@@ -16,7 +18,7 @@ import os
 import time
 from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
@@ -24,16 +26,21 @@ import numpy as np
 
 from bench import classical
 from bench.limit import bounds, ratio
-from bench.maps import session_of, update
-from bench.sessions import Session
+from bench.maps import update
+from bench.sessions import Session, recorded
 from detect.cells import is_within
-from detect.detector import Detector
+from detect.detector import Detection, Detector
 from detect.fit import NAMES
 from detect.refine import refine_detections
+from detect.scores import Marked, score_boxes
+from detect.yolo import KINDS, Boxes
 from mapping.mapper import make_mapper
 from prim.metrics import match_primitives
 from prim.raycast import FloatArray
 from prim.shapes import Kind, Primitive, angle_difference, angle_error
+from recorder.sensors import Lidar
+from recorder.session import SessionOptions
+from recorder.world import WorldOptions
 from replay.lookout import SHIPPED
 
 FIRST_SEED = 40_000
@@ -68,6 +75,7 @@ class Outcome:
 
     primitives: tuple[Found, ...]
     detections: int
+    marked: Marked
     network: tuple[int, int]
     opencv: tuple[int, int]
     detect_s: float
@@ -75,9 +83,21 @@ class Outcome:
     noise_std: float
 
 
-def outcome(seed: int, noise_std: float, mapper: str) -> Outcome:
+CONDITIONS: dict[str, SessionOptions] = {
+    "warped": SessionOptions(),
+    "driven": SessionOptions(motion="drive", duration=40.0, rate=5.0),
+    "no walls": SessionOptions(world=WorldOptions(walls=False)),
+    "180 rays": SessionOptions(lidar=Lidar(rays=180)),
+    "1000 rays": SessionOptions(lidar=Lidar(rays=1000)),
+}
+"""Ways of recording."""
+
+
+def outcome(seed: int, noise_std: float, mapper: str, condition: str = "warped") -> Outcome:
     """Records a session, maps it, detects, refines, and holds all against the truth."""
-    session = session_of(seed, noise_std)
+    options = CONDITIONS[condition]
+    lidar = replace(options.lidar, noise_std=noise_std)
+    session = recorded(replace(options, seed=seed, lidar=lidar))
     made = make_mapper(mapper, 0.01, session.frame.bounds)
     for scan, pose in session.scans:
         made.keep(scan, pose)
@@ -93,7 +113,8 @@ def outcome(seed: int, noise_std: float, mapper: str) -> Outcome:
     pairs = {pair.truth: pair for pair in match_primitives(primitives, session.primitives)}
     peer = classical.detect(grid)
     peers = {pair.truth: pair for pair in match_primitives(peer, session.primitives) if pair.found}
-    limits = bounds(session.scans, session.primitives, ARENA, max(noise_std, 1e-3))
+    walls = ARENA if options.world.walls else np.zeros((0, 4))
+    limits = bounds(session.scans, session.primitives, walls, max(noise_std, 1e-3))
     rows = []
     for k, true in enumerate(session.primitives):
         pair = pairs.get(k)
@@ -124,12 +145,28 @@ def outcome(seed: int, noise_std: float, mapper: str) -> Outcome:
     return Outcome(
         tuple(rows),
         len(primitives),
+        marked(refined.found, session.primitives),
         (sum(pair.found for pair in networks), len(detections.found)),
         (len(peers), len(peer)),
         time.thread_time() - began - (ended - between),
         ended - between,
         found_std or 0.0,
     )
+
+
+def marked(found: Sequence[Detection], true: Sequence[Primitive]) -> Marked:
+    """The boxes around refined outlines, beside the true ones, in cells of 10 mm."""
+    boxes = np.array([box_around(one.primitive) for one in found], np.float32).reshape(-1, 4)
+    kinds = np.array([KINDS.index(one.primitive.kind) for one in found], np.intp)
+    scores = np.array([one.score for one in found], np.float32)
+    there = np.array([box_around(one) for one in true], np.float32).reshape(-1, 4)
+    return Marked(Boxes(boxes, kinds, scores), there, np.array([KINDS.index(one.kind) for one in true], np.intp))
+
+
+def box_around(primitive: Primitive) -> FloatArray:
+    """Left, top, right, bottom in cells of 10 mm."""
+    outline = 100 * primitive.outline()
+    return np.concatenate((outline.min(axis=0), outline.max(axis=0)))
 
 
 def own_errors(one: Primitive, true: Primitive) -> tuple[float, ...]:
@@ -189,7 +226,7 @@ def least_box(points: FloatArray, cut: float = 2.0) -> tuple[float, float, float
     return best[1:]
 
 
-def quality(noise_std: float, of: Sequence[Outcome]) -> str:
+def quality(name: str, of: Sequence[Outcome]) -> str:
     """One row: F1 of networks, peers and refinement, kinds, errors, error bars, time."""
     rows = [row for one in of for row in one.primitives]
     found = [row for row in rows if row.found]
@@ -203,12 +240,14 @@ def quality(noise_std: float, of: Sequence[Outcome]) -> str:
     angles = [row.angle for row in found if row.angle is not None]
     sizes = 1000 * np.array([row.sizes for row in found])
     place = 1000 * np.array([row.place for row in found])
+    scores = score_boxes([one.marked for one in of])["all"]
     each = [one.refine_s / len(one.primitives) for one in of if one.primitives]
     cells = (
-        f"{1000 * noise_std:g} mm",
+        name,
         f1(sum(one.network[0] for one in of), sum(one.network[1] for one in of)),
         f1(sum(one.opencv[0] for one in of), sum(one.opencv[1] for one in of)),
         f1(hits, sum(one.detections for one in of)),
+        f"{scores.map50:.3f} / {scores.map50_95:.3f}",
         f"{sum(row.right for row in seen) / max(len(seen), 1):.1%}",
         f"{place.mean():.2f} / {np.median(place):.2f}",
         f"{sizes.mean():.2f} / {np.median(sizes):.2f}",
@@ -269,27 +308,53 @@ def main() -> None:
     parser.add_argument("--mapper", default="forward")
     parser.add_argument("--noise", type=float, nargs="+", default=[0.05, 0.25, 0.5])
     parser.add_argument("--workers", type=int, default=os.cpu_count())
+    parser.add_argument("--conditions", action="store_true", help="other ways of recording, in the place of peers")
     parser.add_argument("--update", type=Path)
     options = parser.parse_args()
-    errors = [
-        "| noise | F1: networks | OpenCV | **refined** | kind | place, mm | size, mm | angle, ° | z | ms each |",
-        "|---|" + "---:|" * 9,
-    ]
-    limits = ["| noise | kind | found | x | y | angle | size | size 2 |", "|---|---|" + "---:|" * 6]
-    head = "| noise | ours, mm | OpenCV, mm | factor | ours, mm | end points, mm | factor |"
-    peers = [head, "|---|" + "---:|" * 6]
-    seeds = range(options.first_seed, options.first_seed + options.sessions)
     with ProcessPoolExecutor(options.workers) as pool:
-        for noise_std in options.noise:
-            work = partial(outcome, noise_std=noise_std, mapper=options.mapper)
-            of = list(pool.map(work, seeds))
-            errors.append(quality(noise_std, of))
-            limits += limits_table(noise_std, of)
-            peers.append(peers_table(noise_std, of))
-            print(errors[-1], *limits[-5:], peers[-1], sep="\n", flush=True)
-    content = "\n".join([*errors, "", *limits, "", *peers])
+        content = (conditions_tables if options.conditions else tables)(pool, options)
     if options.update:
-        update(options.update, f"refine {options.mapper}", content)
+        name = "conditions" if options.conditions else "refine"
+        update(options.update, f"{name} {options.mapper}", content)
+
+
+HEAD = [
+    "F1: networks | OpenCV | **refined** | mAP50 / 50-95 | kind | place, mm | size, mm | angle, ° | z | ms each |",
+    "|" + "---:|" * 10,
+]
+
+
+def sessions(
+    pool: ProcessPoolExecutor, options: argparse.Namespace, noise_std: float, condition: str = "warped"
+) -> list[Outcome]:
+    """The outcomes of all seeds."""
+    seeds = range(options.first_seed, options.first_seed + options.sessions)
+    return list(pool.map(partial(outcome, noise_std=noise_std, mapper=options.mapper, condition=condition), seeds))
+
+
+def tables(pool: ProcessPoolExecutor, options: argparse.Namespace) -> str:
+    """Errors, ratios to the limit, and peers at each noise level."""
+    errors = ["| noise | " + HEAD[0], "|---" + HEAD[1]]
+    limits = ["| noise | kind | found | x | y | angle | size | size 2 |", "|---|---|" + "---:|" * 6]
+    peers = ["| noise | ours, mm | OpenCV, mm | factor | ours, mm | end points, mm | factor |", "|---|" + "---:|" * 6]
+    for noise_std in options.noise:
+        of = sessions(pool, options, noise_std)
+        errors.append(quality(f"{1000 * noise_std:g} mm", of))
+        limits += limits_table(noise_std, of)
+        peers.append(peers_table(noise_std, of))
+        print(errors[-1], *limits[-5:], peers[-1], sep="\n", flush=True)
+    return "\n".join([*errors, "", *limits, "", *peers])
+
+
+def conditions_tables(pool: ProcessPoolExecutor, options: argparse.Namespace) -> str:
+    """Errors for each way of recording and noise level."""
+    rows = ["| recorded | " + HEAD[0], "|---" + HEAD[1]]
+    for condition in CONDITIONS:
+        for noise_std in options.noise:
+            of = sessions(pool, options, noise_std, condition)
+            rows.append(quality(f"{condition}, {1000 * noise_std:g} mm", of))
+            print(rows[-1], flush=True)
+    return "\n".join(rows)
 
 
 if __name__ == "__main__":

@@ -26,6 +26,7 @@ from detect.raycost import (
     trace,
     walk,
 )
+from mapping.forward import neighbour_noise
 from mapping.grid import GridFrame
 from prim.frames import Pose2D, Scan
 from prim.raycast import FloatArray
@@ -33,6 +34,12 @@ from prim.shapes import Kind, Primitive
 
 MOST = 8000
 """A primitive is fitted to about so many rays at most; of more, scans are left out evenly."""
+
+NOISE_SCANS = 40
+MOST_NOISE, LEAST_MOST = 2.0, 0.01
+"""The noise is no more than so many times what the differences of neighbouring beams show, in as many scans; and what
+is less than so much (m) is not held against it.
+"""
 
 OUTLIERS = 0.005
 """The share of ranges that have nothing to do with what stands there; spread evenly over all ranges."""
@@ -101,7 +108,7 @@ class Sensor:
 
     ``footprint`` (m): half the width over which a beam that passes an edge may meet it or not: the beam's own width,
     and how far poses and bearings are off. ``dispersion``: how much larger the squared errors of whole scans are than
-    those of single rays would make them; 1 where poses are exact.
+    those of single rays would make them; 1 where poses are exact. ``most`` (m): the noise is no larger than this.
     """
 
     std: float
@@ -109,11 +116,14 @@ class Sensor:
     table: FloatArray
     footprint: float = 0.0
     dispersion: float = 1.0
+    most: float = math.inf
 
     @classmethod
-    def of(cls, std: float, span: float, footprint: float = 0.0, dispersion: float = 1.0) -> Sensor:
+    def of(
+        cls, std: float, span: float, footprint: float = 0.0, dispersion: float = 1.0, most: float = math.inf
+    ) -> Sensor:
         """The sensor with such noise and span."""
-        return cls(std, span, tables(OUTLIERS * _peak_share(std, span)), footprint, dispersion)
+        return cls(std, span, tables(OUTLIERS * _peak_share(std, span)), footprint, dispersion, most)
 
 
 def _peak_share(std: float, span: float) -> float:
@@ -136,10 +146,13 @@ class Gatherer:
         self._stride = [1] * len(reach)
         self._count = 0
         self.span = 0.0
+        self._ranges: list[NDArray[np.float32]] = []
 
     def add(self, scan: Scan, pose: Pose2D) -> None:
         """Adds a scan, taken by a laser at ``pose``."""
         self._count += 1
+        if len(self._ranges) < NOISE_SCANS:
+            self._ranges.append(scan.ranges)
         away = np.hypot(*(self._centres - (pose.x, pose.y)).T)
         near = np.flatnonzero(away - self._reach < scan.range_max)
         if not len(near):
@@ -179,6 +192,12 @@ class Gatherer:
             self._size[k] = sum(len(one) for one in self._kept[k])
             self._stride[k] *= 2
 
+    @property
+    def most_noise(self) -> float:
+        """The noise (m) is no larger than this: neighbouring beams of some scans would differ by more."""
+        guess = neighbour_noise(np.concatenate(self._ranges)) if self._ranges else None
+        return max(MOST_NOISE * guess, LEAST_MOST) if guess else math.inf
+
     def beams(self) -> list[Beams]:
         """Each circle's rays."""
         return [Beams.joined(kept) for kept in self._kept]
@@ -186,13 +205,13 @@ class Gatherer:
 
 def gather(
     scans: Iterable[tuple[Scan, Pose2D]], primitives: Sequence[Primitive], reach: float
-) -> tuple[list[Beams], float]:
-    """The rays that come within ``reach`` (m) of each primitive, and the largest span of ranges (m)."""
+) -> tuple[list[Beams], float, float]:
+    """The rays that come within ``reach`` (m) of each primitive, the largest span of ranges, the most noise (m)."""
     centres = np.array([(one.x, one.y) for one in primitives]).reshape(-1, 2)
     gatherer = Gatherer(centres, np.array([circumradius(one) + reach for one in primitives]))
     for scan, pose in scans:
         gatherer.add(scan, pose)
-    return gatherer.beams(), gatherer.span
+    return gatherer.beams(), gatherer.span, gatherer.most_noise
 
 
 @dataclass(frozen=True)

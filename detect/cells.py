@@ -5,13 +5,14 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
 from detect.lines import Line, find_lines
 from mapping.grid import GridFrame, OccupancyGrid
-from prim.metrics import BoolGrid
+from prim.metrics import BoolGrid, dilate
 from prim.raycast import FloatArray
 from prim.shapes import Primitive
 
@@ -83,6 +84,17 @@ class MapCells:
         outline = primitive.outline(32)
         return any(wall.hides(outline, PIERCED, 0.0) for wall in self.walls)
 
+    @cached_property
+    def wall_surface(self) -> FloatArray:
+        """The centres (N, 2) in metres of large things' cells that are next to something free."""
+        return centres(self.large & beside_free(self.free), self.frame)
+
+    def large_within(self, primitive: Primitive, margin: float) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+        """Rows and columns of large things' cells in a primitive and within ``margin`` (m) of it."""
+        rows, cols, points = _cells_around(self.frame, primitive, circumradius(primitive) + margin)
+        at_rows, at_cols = np.nonzero(self.large[rows, cols] & is_within(primitive, points, margin))
+        return at_rows + rows.start, at_cols + cols.start
+
     def hide(self, primitive: Primitive) -> bool:
         """Whether a primitive's middle lies behind such a wall, or behind where the wall would go on to."""
         middle = np.array([[primitive.x, primitive.y]])
@@ -141,7 +153,7 @@ def _along_lines(grid: OccupancyGrid) -> tuple[BoolGrid, list[OneSided]]:
     surface = centres(grid.occupied & beside_free(grid.free), grid.frame)
     rows, cols = np.nonzero(grid.occupied)
     points = centres(grid.occupied, grid.frame)
-    free = centres(grid.free, grid.frame)
+    free = centres(grid.free & dilate(grid.occupied, round(2 * WALL_CELLS)), grid.frame)
     near = np.zeros(len(points), np.bool_)
     one_sided = []
     for line in find_lines(surface, resolution, LEAST_WALL, MOST_WALLS):

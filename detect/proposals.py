@@ -12,7 +12,7 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from detect.cells import MapCells, is_within
+from detect.cells import MapCells, circumradius, is_within
 from prim.metrics import dilate
 from prim.raycast import FloatArray
 from prim.shapes import Kind, Primitive
@@ -37,12 +37,17 @@ MOST_PROPOSALS = 24
 def proposals(cells: MapCells, found: Sequence[Primitive]) -> list[Primitive]:
     """Rectangles around things in a map that are in no primitive ``found``, the largest first."""
     made = []
+    middles = np.array([(one.x, one.y) for one in found]).reshape(-1, 2)
+    reaches = np.array([circumradius(one) + NEAR for one in found])
     for points in blobs(cells):
-        inside = np.zeros(len(points), np.bool_)
-        for one in found:
-            inside |= is_within(one, points, NEAR)
         around = rectangle_around(points, cells.frame.resolution)
-        if inside.mean() <= COVERED and around is not None and not cells.hide(around):
+        if around is None or cells.hide(around):
+            continue
+        inside = np.zeros(len(points), np.bool_)
+        apart = np.hypot(*(middles - (around.x, around.y)).T)
+        for near in np.flatnonzero(apart < reaches + circumradius(around)).tolist():
+            inside |= is_within(found[near], points, NEAR)
+        if inside.mean() <= COVERED:
             made.append((len(points), around))
     made.sort(key=lambda one: -one[0])
     return [around for _, around in made[:MOST_PROPOSALS]]
@@ -51,10 +56,10 @@ def proposals(cells: MapCells, found: Sequence[Primitive]) -> list[Primitive]:
 def blobs(cells: MapCells) -> Iterator[FloatArray]:
     """The centres (N, 2) in metres of the cells of each thing that is not large."""
     frame = cells.frame
-    order = np.argsort(cells.labels, axis=None, kind="stable")
-    numbers = cells.labels.ravel()[order]
-    first, last = np.searchsorted(numbers, [1, cells.labels.max() + 1])
-    for part in np.split(order[first:last], np.flatnonzero(np.diff(numbers[first:last])) + 1):
+    occupied = np.flatnonzero(cells.labels)
+    numbers = cells.labels.flat[occupied]
+    order = np.argsort(numbers, kind="stable")
+    for part in np.split(occupied[order], np.flatnonzero(np.diff(numbers[order])) + 1):
         if len(part) < LEAST_CELLS or cells.large.flat[part[0]]:
             continue
         rows, cols = np.divmod(part, frame.cols)

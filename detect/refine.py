@@ -49,6 +49,12 @@ from prim.metrics import polygon_areas
 from prim.raycast import FloatArray
 from prim.shapes import Kind, Primitive
 
+WITHIN = 2.5
+"""Others further away than this (m) are not reckoned with: few rays pass both, and say the same of all shapes."""
+
+MOST_DOUBTFUL = 24
+"""Of what the networks were unsure of, no more than this is asked the rays about: the best."""
+
 REACH, REACH_FITTED = 0.07, 0.03
 """Rays that come within this (m) of a candidate are looked at: at first, and once it is fitted."""
 
@@ -67,6 +73,9 @@ LEAST_GAIN = 25.0
 MOST_MISFIT = 0.25
 """Of the rays that meet a primitive, the map explains each better by no more than this (nats) on average."""
 
+MOST_SPREAD = 0.2
+"""And its sizes are known to within this share of them (one standard deviation)."""
+
 LEAST_SEEN = 0.35
 """What the networks did not find, or hardly, must be seen in this share of the directions around it."""
 
@@ -78,9 +87,6 @@ SURE = 0.95
 
 LEAST_SHARED = 0.25
 """And it shares this much of the smaller area with what it was first taken for."""
-
-MOST_SPREAD = 0.2
-"""And its sizes are known to within this share of them (one standard deviation)."""
 
 SECTORS = 24
 """Directions around a primitive's centroid, in which its outline is seen or not."""
@@ -186,7 +192,8 @@ def refine_detections(
     rays support, likeliest first, what they do not with the reasons, and the noise: None where no ray passes any.
     """
     cells = MapCells.of(grid)
-    unsure = [one for one, _ in detections.doubtful if not cells.hide(one.primitive)] if before is None else []
+    unsure = [] if before else [one for one, _ in detections.doubtful if not cells.hide(one.primitive)]
+    unsure = sorted(unsure, key=lambda one: -one.score)[:MOST_DOUBTFUL]
     guesses = [one.primitive for one in (*detections.found, *unsure)]
     added = [_proposed(one) for one in proposals(cells, guesses)] if before is None else []
     wanted = (*detections.found, *unsure, *added)
@@ -233,6 +240,8 @@ def contradiction(made: Refined | None) -> str:
         return f"the rays are likelier with it by {made.gain:.0f} nats only, less than {LEAST_GAIN:g}"
     if made.misfit > MOST_MISFIT:
         return f"its rays are likelier by {made.misfit:.2f} nats each in the map alone, more than {MOST_MISFIT:g}"
+    if any(made.std[name] > MOST_SPREAD * size for name, size in made.primitive.sizes.items()):
+        return f"its sizes are not known to within {MOST_SPREAD:.0%}"
     return ""
 
 
@@ -248,8 +257,6 @@ def doubt(made: Refined | None, guess: Primitive, cells: MapCells) -> str:
         return f"{before}it reaches into a wall"
     if _share(made.primitive, guess) < LEAST_SHARED:
         return f"{before}what explains its rays stands elsewhere"
-    if any(made.std[name] > MOST_SPREAD * size for name, size in made.primitive.sizes.items()):
-        return f"{before}its sizes are not known to within {MOST_SPREAD:.0%}"
     if made.score < LEAST_SURE:
         return f"{before}its kind is sure by {made.score:.2f} only, less than {LEAST_SURE:g}"
     return ""
@@ -281,7 +288,7 @@ def refine(
     """
     if not primitives:
         return [], noise_std
-    around, span = gather(scans, primitives, REACH)
+    around, span, most = gather(scans, primitives, REACH)
     known = known or {}
     candidates = [
         Candidate(start, beams, cells, known.get(number))
@@ -290,7 +297,7 @@ def refine(
     seen = [one for one in candidates if len(one.beams)]
     if not seen:
         return [None] * len(primitives), noise_std
-    sensor = Sensor.of(noise_std or first_noise(seen), span)
+    sensor = Sensor.of(noise_std or min(first_noise(seen), most), span, most=most)
     with ThreadPoolExecutor(threads) as pool:
         look_behind(seen, cells, CLEARED_FIRST)
         fit_all(pool, seen, [True] * len(seen), sensor)
@@ -300,7 +307,7 @@ def refine(
         alone = [one for one in alone if len(one.beams)]
         if not alone:
             return [None] * len(primitives), noise_std
-        sensor = Sensor.of(noise_std or measured_noise(alone, sensor), span)
+        sensor = Sensor.of(noise_std or measured_noise(alone, sensor), span, most=most)
         for _ in range(ROUNDS):
             changed = look_behind(alone, cells, CLEARED)
             fit_all(pool, alone, changed, sensor)
@@ -347,12 +354,12 @@ def look_behind(candidates: Sequence[Candidate], cells: MapCells, margin: float)
     occupied = cells.without(shapes, margin)
     walls = walls_behind(cells, shapes, [one.beams.rays[:, :2].mean(axis=0) for one in candidates])
     for wall in walls:
-        occupied &= ~wall.cells
+        occupied[wall.cells] = False
     changed = []
     for one in candidates:
         before = one.map_behind
         one.map_behind = backdrop(one.beams, occupied, cells.frame)
-        one.walls = walls
+        one.walls = [wall for wall in walls if _apart(wall.stretch, one.start) < WITHIN]
         moved = before is None or np.mean(np.abs(before.stops - one.map_behind.stops) > MOVED) > MOVED_SHARE
         changed.append(bool(moved))
     return changed
@@ -376,9 +383,9 @@ def _residuals(beams: Beams, primitive: Primitive) -> FloatArray:
 def measured(candidates: Sequence[Candidate], sensor: Sensor, noise_std: float | None) -> Sensor:
     """What the candidates' rays tell of the sensor: its noise where it is not given, footprint and dispersion."""
     std = noise_std or measured_noise(candidates, sensor)
-    sensor = Sensor.of(std, sensor.span, sensor.footprint)
+    sensor = Sensor.of(std, sensor.span, sensor.footprint, most=sensor.most)
     footprint = measured_footprint(candidates, sensor)
-    return Sensor.of(std, sensor.span, footprint, measured_dispersion(candidates, sensor))
+    return Sensor.of(std, sensor.span, footprint, measured_dispersion(candidates, sensor), sensor.most)
 
 
 def measured_footprint(candidates: Sequence[Candidate], sensor: Sensor) -> float:
@@ -434,7 +441,7 @@ def measured_noise(candidates: Sequence[Candidate], sensor: Sensor) -> float:
         table = Sensor.of(std, sensor.span).table
         return count * log_std - float(in_table(table, kinds, (distance - z) / std).sum())
 
-    return max(math.exp(_least(cost, math.log(sensor.std))), LEAST_NOISE)
+    return min(max(math.exp(_least(cost, math.log(sensor.std))), LEAST_NOISE), sensor.most)
 
 
 def _met(candidate: Candidate, beams: Beams) -> tuple[FloatArray, NDArray[np.int8], FloatArray]:
@@ -464,7 +471,7 @@ def _least(cost: Callable[[float], float], at: float, step: float = 0.5) -> floa
 
 def before_others(candidate: Candidate, among: Sequence[Candidate], sensor: Sensor) -> Beams:
     """A candidate's beams, with what they say where they miss it."""
-    others = [one.now for one in among if one is not candidate]
+    others = [one.now for one in among if one is not candidate and _apart(one.start, candidate.start) < WITHIN]
     assert candidate.map_behind is not None
     return behind(
         candidate.beams, candidate.map_behind, [*others, *(wall.stretch for wall in candidate.walls)], sensor
@@ -487,9 +494,14 @@ def gain_of(candidate: Candidate, among: Sequence[Candidate], sensor: Sensor) ->
     return float(-beams.rays[:, MISS].sum() - candidate.fits[0].cost)
 
 
+def _apart(a: Primitive, b: Primitive) -> float:
+    """How far (m) two primitives' middles are from each other."""
+    return math.hypot(a.x - b.x, a.y - b.y)
+
+
 def _share(a: Primitive, b: Primitive) -> float:
     """How much two primitives share, of the smaller one's area."""
-    if math.hypot(a.x - b.x, a.y - b.y) > circumradius(a) + circumradius(b):
+    if _apart(a, b) > circumradius(a) + circumradius(b):
         return 0.0
     first, second, shared = polygon_areas(a, b)
     return shared / min(first, second)

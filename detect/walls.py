@@ -11,11 +11,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
-from detect.cells import MapCells, beside_free, centres, circumradius, is_within
+from detect.cells import MapCells, circumradius, is_within
 from detect.lines import Line, find_lines
-from mapping.grid import GridFrame
-from prim.metrics import BoolGrid
 from prim.raycast import FloatArray
 from prim.shapes import Kind, Primitive
 
@@ -28,6 +27,12 @@ AROUND = 0.5
 LEAST_LENGTH = 0.12
 """So much (m) of a wall must be seen at both sides."""
 
+OWN = 0.04
+"""Cells this near (m) to a candidate say nothing of a wall's line."""
+
+WALL_CELLS = 3.5
+"""Cells this near (cells) to the stretch stand for it."""
+
 DEPTH = 0.02
 """How far (m) a primitive may reach into a wall: the wall's line is no surer."""
 
@@ -37,12 +42,12 @@ THICKNESS = 0.002
 @dataclass(frozen=True)
 class Wall:
     """A stretch of a wall behind a candidate, the line it lies on (its normal points to where it is seen from), and
-    the map's cells that stand for it there (rows, cols).
+    the map's cells that stand for it there (their rows and columns).
     """
 
     stretch: Primitive
     line: Line
-    cells: BoolGrid
+    cells: tuple[NDArray[np.intp], NDArray[np.intp]]
 
     def is_cut_by(self, primitive: Primitive) -> bool:
         """Whether a primitive reaches behind the stretch by more than DEPTH: nothing does."""
@@ -58,15 +63,20 @@ def walls_behind(cells: MapCells, candidates: Sequence[Primitive], eyes: Sequenc
 
     ``eyes`` (2,): for each candidate the middle (m) of where it is seen from.
     """
-    points = centres(cells.large & beside_free(cells.free), cells.frame)
-    close = [is_within(one, points, CLOSE).any() for one in candidates]
-    for one in candidates:
-        points = points[~is_within(one, points, 0.04)]
+    from scipy.spatial import cKDTree  # when it is needed: a replay without refinement starts faster
+
+    points = cells.wall_surface
+    if not len(points):
+        return []
+    surface, places = cKDTree(points), cKDTree([(one.x, one.y) for one in candidates])
     made = []
-    for one, eye, is_close in zip(candidates, eyes, close, strict=True):
-        if not is_close:
+    for one, eye in zip(candidates, eyes, strict=True):
+        reach = circumradius(one) + AROUND
+        near = points[surface.query_ball_point((one.x, one.y), reach)]
+        if not is_within(one, near, CLOSE).any():
             continue
-        near = points[np.hypot(*(points - (one.x, one.y)).T) < circumradius(one) + AROUND]
+        for other in places.query_ball_point((one.x, one.y), 2 * reach):
+            near = near[~is_within(candidates[other], near, OWN)]
         for nx, ny, d in find_lines(near, cells.frame.resolution, 2 * LEAST_LENGTH, 2):
             side = 1.0 if nx * eye[0] + ny * eye[1] > d else -1.0
             wall = _stretch(cells, one, (side * nx, side * ny, side * d), near)
@@ -95,14 +105,4 @@ def _stretch(cells: MapCells, candidate: Primitive, line: Line, points: FloatArr
     stretch = Primitive(
         Kind.RECTANGLE, nx * d - ny * at, ny * d + nx * at, theta, (high - low, THICKNESS)
     ).canonical()
-    return Wall(stretch, line, _cells_of(cells.frame, cells.large, stretch))
-
-
-def _cells_of(frame: GridFrame, large: BoolGrid, stretch: Primitive) -> BoolGrid:
-    """The large cells (rows, cols) that stand for a stretch of a wall: within three and a half cells of it."""
-    rows, cols = np.nonzero(large)
-    points = centres(large, frame)
-    inside = is_within(stretch, points, 3.5 * frame.resolution)
-    found = np.zeros_like(large)
-    found[rows[inside], cols[inside]] = True
-    return found
+    return Wall(stretch, line, cells.large_within(stretch, WALL_CELLS * resolution))

@@ -227,7 +227,7 @@ def test_rays_are_thinned_where_they_are_too_many() -> None:
 def test_behind_a_primitive_stands_what_the_map_and_the_others_say() -> None:
     world = room(shape(Kind.CIRCLE), shape(Kind.SQUARE, 0.5, 0.0))
     taken = scans(world, 0.0)
-    (around,), span = gather(taken, [world.primitives[0]], 0.05)
+    (around,), span, _ = gather(taken, [world.primitives[0]], 0.05)
     from detect.beams import backdrop
 
     cells = MapCells.of(mapped(taken))
@@ -292,7 +292,8 @@ def test_walls_are_large_and_primitives_are_not(
 
 
 def test_reasons_name_the_limit() -> None:
-    made = Refined(FIVE[0], {}, np.eye(4), dict.fromkeys(Kind, 0.2), 3.0, 0.0, 100, 1.0)
+    made = Refined(FIVE[0], {"side": 0.001}, np.eye(4), dict.fromkeys(Kind, 0.2), 3.0, 0.0, 100, 1.0)
     assert "by 3 nats only" in contradiction(made)
     assert "in the map alone" in contradiction(replace(made, gain=100.0, misfit=2.0))
+    assert "not known to within 20%" in contradiction(replace(made, gain=100.0, std={"side": 0.05}))
     assert contradiction(replace(made, gain=100.0)) == "" and "too large" in contradiction(None)
