@@ -7,7 +7,7 @@ NOISE_STD ?= 0.05
 
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
 
-.PHONY: demo test test-slow bench bench-maps bench-forward lint format clean
+.PHONY: demo test test-slow bench bench-maps bench-forward bench-refine lint format clean
 
 demo: .venv/installed
 	@mkdir -p demo
@@ -36,6 +36,10 @@ bench-forward: .venv/installed
 	$(BIN)/python -m bench.forward --update docs/forward.md
 	$(BIN)/python -m bench.heldout --update docs/forward.md
 	$(BIN)/python -m bench.calibrate check --update docs/forward.md
+
+bench-refine: .venv/installed
+	$(BIN)/python -m bench.refine --update docs/refine.md --short README.md
+	$(BIN)/python -m bench.refine --conditions --sessions 40 --update docs/refine.md
 
 lint: .venv/installed-dev
 	$(BIN)/ruff check .

@@ -309,13 +309,23 @@ def main() -> None:
     parser.add_argument("--noise", type=float, nargs="+", default=[0.05, 0.25, 0.5])
     parser.add_argument("--workers", type=int, default=os.cpu_count())
     parser.add_argument("--conditions", action="store_true", help="other ways of recording, in the place of peers")
-    parser.add_argument("--update", type=Path)
+    parser.add_argument("--update", type=Path, help="the document that gets the tables")
+    parser.add_argument("--short", type=Path, help="the document that gets the short one")
     options = parser.parse_args()
     with ProcessPoolExecutor(options.workers) as pool:
         content = (conditions_tables if options.conditions else tables)(pool, options)
     if options.update:
         name = "conditions" if options.conditions else "refine"
         update(options.update, f"{name} {options.mapper}", content)
+    if options.short:
+        update(options.short, "refine short", short(content))
+
+
+def short(content: str) -> str:
+    """The first table without what only the long one explains."""
+    rows = [line.split("|")[1:-1] for line in content.split("\n\n")[0].splitlines()]
+    chosen = [0, 1, 2, 3, 6, 7, 8, 9]
+    return "\n".join("|" + "|".join(row[k] for k in chosen) + "|" for row in rows)
 
 
 HEAD = [
