@@ -51,6 +51,15 @@ def test_a_blob_becomes_a_primitive_where_it_lies() -> None:
     assert one.crop.shape == (72, 72)
 
 
+def test_what_scores_too_little_is_kept_for_the_rays() -> None:
+    """The best of its place alone, measured, with its rejection; what was found leaves no doubt beside it."""
+    found = detector({"circle": 0.95}).detect(grid_with((0.7, 1.3)))
+    ((doubtful, rejection),) = found.doubtful
+    assert doubtful.score == pytest.approx(0.9) and rejection in found.rejected
+    assert (doubtful.primitive.x, doubtful.primitive.y) == pytest.approx((0.7 + 0.04, 1.3 - 0.02), abs=0.006)
+    assert detector({"circle": 0.3}).detect(grid_with((0.7, 1.3))).doubtful == ()
+
+
 def test_every_rejected_candidate_says_by_which_threshold() -> None:
     found = detector({"circle": 0.95}).detect(grid_with((0.7, 1.3)))
     assert not found.found

@@ -162,3 +162,40 @@ def test_what_is_no_checkpoint_is_not_exported(tmp_path: Path) -> None:
         export_cnn(path, "det", tmp_path / "a.onnx")
     with pytest.raises(UsageError, match="--trust"):
         export_yolo(path, "det", tmp_path / "a.onnx", trust=False)
+
+
+def test_an_exported_network_can_be_trained_on(tmp_path: Path) -> None:
+    """Reopened, with normalisations put back, it gives the same numbers; nothing in the file is run."""
+    torch = pytest.importorskip("torch", reason="needs the extra [train]")
+    pytest.importorskip("ultralytics", reason="needs the extra [train]")
+    from detect.export import reopen_cnn, reopen_yolo
+    from detect.networks import ParameterNetwork
+    from detect.parameters import PRIM
+    from prim.errors import UsageError
+    from prim.shapes import Kind
+    from replay.lookout import SHIPPED
+
+    torch.manual_seed(0)
+    yolo, (cnn,) = load_set(SHIPPED / "forward")
+    images = torch.rand(4, 3, 96, 96)
+    opened = torch.load(reopen_yolo(yolo.path, images, tmp_path / "a.pt"), weights_only=False)["model"].float()
+    with torch.no_grad():
+        again = opened.eval()(images)[0].numpy()
+    before = yolo.session.run(None, {"images": images.numpy()})[0]
+    assert again == pytest.approx(before, abs=2e-3)
+    seen = opened.train()(images)  # normalisations that fit what they see: training begins where it was left
+    assert all(torch.isfinite(part).all() for part in seen.values() if isinstance(part, torch.Tensor))
+
+    network, crops = ParameterNetwork(list(Kind), PRIM), torch.rand(4, 1, 72, 72)
+    reopen_cnn(cnn.path, network, crops)
+    with torch.no_grad():
+        outputs = network.eval()(crops).numpy()
+    assert outputs == pytest.approx(cnn.session.run(None, {"crops": crops.numpy()})[0], abs=1e-4)
+
+    with pytest.raises(UsageError, match="no YOLOv5n"):
+        reopen_yolo(cnn.path, images, tmp_path / "b.pt")
+    with pytest.raises(UsageError, match="no network of this preset"):
+        reopen_cnn(yolo.path, network, crops)
+    (tmp_path / "junk.onnx").write_bytes(b"junk")
+    with pytest.raises(UsageError, match="no ONNX network"):
+        reopen_cnn(tmp_path / "junk.onnx", network, crops)

@@ -1,6 +1,7 @@
 """The pipeline as a library: lasers that hang upside down, truth that moves, the same result every time."""
 
 import json
+import time
 from dataclasses import replace
 from pathlib import Path
 
@@ -22,7 +23,7 @@ from prim.shapes import Kind, Primitive
 from prim.world import World
 from recorder.sensors import Lidar
 from recorder.session import Session
-from replay.pipeline import Pipeline, ReplayOptions, ReplayResult
+from replay.pipeline import Clock, Pipeline, ReplayOptions, ReplayResult
 from tests.replay.test_localize import raw_transform
 
 STAMP = 5 * 10**9
@@ -91,3 +92,14 @@ def test_a_replay_can_be_repeated(noisy_session: Session) -> None:
 def test_rays_that_were_not_used_are_not_counted(noisy_session: Session) -> None:
     result = Pipeline(noisy_session.path, ReplayOptions()).run()
     assert result.rays == result.scans_used * 180
+
+
+def test_time_within_a_stage_counts_to_the_inner_one() -> None:
+    clock = Clock()
+    with clock.stage("refine"):
+        with clock.stage("read"):
+            time.sleep(0.02)
+        with clock.stage("read"):
+            time.sleep(0.02)
+    assert clock.seconds["read"] >= 0.04 and clock.seconds["refine"] < clock.seconds["read"] / 2
+    assert sum(clock.seconds.values()) <= clock.total()
