@@ -29,6 +29,9 @@ DEGREES = 6.0
 EFFECTIVE = 0.15
 """In all rounds but the last, weights are made more alike until this share of the samples counts."""
 
+LEAST_EFFECTIVE = 0.04
+"""So are they in the last, until this share does: where fewer would, they would tell too small a spread."""
+
 LEAST_STD = (1e-4, 1e-4, 1e-3, 1e-4, 1e-4)
 MOST_TURN = 0.5
 """Bounds on what samples are spread over (m, rad)."""
@@ -95,7 +98,7 @@ def sample(fit: Fit, beams: Beams, sensor: Sensor) -> Sampled:
         cost = split.costs(points @ tie.T)
         log_weight = -cost / sensor.dispersion - log_density + np.log(np.diag(lower)).sum()
         weight = np.exp(log_weight - log_weight.max())
-        share = _tempered(weight, EFFECTIVE if count < len(rounds) else 0.0)
+        share = _tempered(weight, EFFECTIVE if count < len(rounds) else LEAST_EFFECTIVE)
         mean = share @ points
         centred = points - mean
         covariance = (share[:, None] * centred).T @ centred
