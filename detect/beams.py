@@ -18,10 +18,12 @@ from detect.raycost import (
     MISS,
     NO_RETURN,
     RANGE,
+    SAYS_NOTHING,
     STOP,
     TOO_NEAR,
     TRIANGLE,
     pass_by,
+    passing,
     tables,
     trace,
     walk,
@@ -158,30 +160,37 @@ class Gatherer:
         if not len(near):
             return
         self.span = max(self.span, scan.range_max - scan.range_min)
+        kinds, z = _measurements(scan)
+        chosen = np.empty(len(z), np.int64)
         cos, sin = math.cos(pose.theta), math.sin(pose.theta)
-        directions = scan.directions @ np.array([[cos, sin], [-sin, cos]])
-        z = scan.ranges.astype(np.float64)
-        kinds = np.full(len(z), MEASURED, np.int8)
-        kinds[z >= scan.range_max] = NO_RETURN
-        kinds[z == -np.inf] = TOO_NEAR
-        says = (z >= max(scan.range_min, np.nextafter(0.0, 1.0))) | (kinds == TOO_NEAR)
-        z = np.where(kinds == MEASURED, z, np.where(kinds == TOO_NEAR, scan.range_min, scan.range_max))
         for k in near.tolist():
             if self._count % self._stride[k]:
                 continue
             towards = self._centres[k] - (pose.x, pose.y)
-            aside = np.abs(directions[:, 0] * towards[1] - directions[:, 1] * towards[0])
-            passes = (aside < self._reach[k]) & (directions @ towards > -self._reach[k]) & says
-            chosen = np.flatnonzero(passes)
-            if len(chosen):
-                rays = np.zeros((len(chosen), 7))
-                rays[:, :2] = pose.x, pose.y
-                rays[:, 2:4] = directions[chosen]
-                rays[:, RANGE] = z[chosen]
-                near_from = directions[chosen] @ towards - self._reach[k]
-                far = np.full(len(chosen), scan.range_max)
-                number = np.full(len(chosen), self._count, np.int32)
-                self._keep(k, Beams(rays, kinds[chosen], near_from, far, number))
+            x, y = towards.tolist()
+            count = passing(scan.directions, cos, sin, x, y, self._reach[k], kinds, chosen)
+            if count:
+                self._keep(k, self._beams(scan, pose, kinds, z, chosen[:count], towards, self._reach[k]))
+
+    def _beams(
+        self,
+        scan: Scan,
+        pose: Pose2D,
+        kinds: NDArray[np.int8],
+        z: FloatArray,
+        chosen: NDArray[np.int64],
+        towards: FloatArray,
+        reach: float,
+    ) -> Beams:
+        """Some of a scan's rays."""
+        cos, sin = math.cos(pose.theta), math.sin(pose.theta)
+        directions = scan.directions[chosen] @ np.array([[cos, sin], [-sin, cos]])
+        rays = np.zeros((len(chosen), 7))
+        rays[:, :2] = pose.x, pose.y
+        rays[:, 2:4] = directions
+        rays[:, RANGE] = z[chosen]
+        far, number = np.full(len(chosen), scan.range_max), np.full(len(chosen), self._count, np.int32)
+        return Beams(rays, kinds[chosen], directions @ towards - reach, far, number)
 
     def _keep(self, k: int, beams: Beams) -> None:
         """Keeps one scan's rays for a circle; leaves out every other scan where they become too many."""
@@ -201,6 +210,19 @@ class Gatherer:
     def beams(self) -> list[Beams]:
         """Each circle's rays."""
         return [Beams.joined(kept) for kept in self._kept]
+
+
+def _measurements(scan: Scan) -> tuple[NDArray[np.int8], FloatArray]:
+    """What each beam of a scan measured (SAYS_NOTHING: NaN, and what is below range_min), and the range or its limit.
+
+    Only -inf is «too near»: REP 117 calls numbers below range_min errors.
+    """
+    z = scan.ranges.astype(np.float64)
+    kinds = np.full(len(z), SAYS_NOTHING, np.int8)
+    kinds[(z >= scan.range_min) & (z > 0)] = MEASURED
+    kinds[z >= scan.range_max] = NO_RETURN
+    kinds[z == -np.inf] = TOO_NEAR
+    return kinds, np.where(kinds == TOO_NEAR, scan.range_min, np.where(kinds == NO_RETURN, scan.range_max, z))
 
 
 def gather(
@@ -237,17 +259,25 @@ def backdrop(beams: Beams, occupied: NDArray[np.bool_], frame: GridFrame) -> Bac
     return Backdrop(stops, ends, ends & (stops < beams.near), 0.5 * frame.resolution)
 
 
-def behind(beams: Beams, map_behind: Backdrop, others: Sequence[Primitive], sensor: Sensor) -> Beams:
-    """The beams with what they say where they miss a primitive: STOP and MISS, from the map and other primitives."""
+def map_says(beams: Beams, behind: Backdrop, sensor: Sensor) -> FloatArray:
+    """The logarithm of the likelihood (N,) of what beams measured where they end in the map behind a primitive."""
+    return np.asarray(np.log(explained(beams, behind.stops, behind.ends, behind.spread, sensor)))
+
+
+def before(beams: Beams, behind: Backdrop, by_map: FloatArray, others: Sequence[Primitive], sensor: Sensor) -> Beams:
+    """The beams with what they say where they miss a primitive: STOP and MISS, from other primitives and the map.
+
+    ``by_map`` (N,) is what :func:`map_says`.
+    """
     rays = beams.rays.copy()
-    stops, ends = map_behind.stops, map_behind.ends
-    miss = np.log(explained(beams, stops, ends, map_behind.spread, sensor))
     nearest = np.full(len(beams), FAR)
     for other in others:
         _shorten(nearest, beams, other)
-    first = nearest < stops
-    rays[:, STOP] = np.where(map_behind.blocked, 0.0, nearest)
-    rays[:, MISS] = np.where(first, log_likelihood(beams, np.where(first, nearest, 1.0), sensor), miss)
+    first = np.flatnonzero(nearest < behind.stops)
+    rays[:, STOP] = np.where(behind.blocked, 0.0, nearest)
+    rays[:, MISS] = by_map
+    x = (nearest[first] - beams.rays[first, RANGE]) / sensor.std
+    rays[first, MISS] = in_table(sensor.table, beams.kinds[first], x)
     return replace(beams, rays=rays)
 
 
@@ -259,12 +289,6 @@ def _shorten(nearest: FloatArray, beams: Beams, other: Primitive) -> None:
     distance = np.empty(len(near))
     trace(FAMILY[other.kind], parameters(other), beams.rays[near], distance)
     nearest[near] = np.minimum(nearest[near], distance)
-
-
-def log_likelihood(beams: Beams, distance: FloatArray, sensor: Sensor) -> FloatArray:
-    """The logarithm of the likelihood (N,) of what beams measured where they end at ``distance`` (N,)."""
-    x = (distance - beams.rays[:, RANGE]) / sensor.std
-    return in_table(sensor.table, beams.kinds, x)
 
 
 def in_table(table: FloatArray, kinds: NDArray[np.int8], x: FloatArray) -> FloatArray:

@@ -22,7 +22,7 @@ CONTENDER = 7.0
 LONGEST = 0.7
 """Sizes are taken to be even up to this (m), before the rays are asked."""
 
-SAMPLES = (300, 300, 600)
+SAMPLES = (240, 240, 480)
 DEGREES = 6.0
 """So many samples are drawn in each round, from Student's t with so many degrees of freedom: its tails are heavy."""
 

@@ -21,8 +21,8 @@ FINE_BLURS = (0.008, 0.001)
 """Fits go from one blur (m, half a footprint) to the next; the last is no smaller than the sensor's own."""
 
 COARSE_STEPS, FINE_STEPS = 8, 10
-TOLERANCE = 0.05
-"""A fit ends where a step gains less than this (nats)."""
+TOLERANCE, ROUGH = 0.1, 0.5
+"""A fit ends where a step gains less than this (nats); one that only tells what to go on with, than the latter."""
 
 HOPELESS, HOPELESS_WAY = 60.0, 20.0
 """A kind whose coarse fit is this much (nats) less likely than the best one's is not fitted to all rays, nor is
@@ -129,7 +129,7 @@ def _best_ways(ranked: Sequence[tuple[float, FloatArray]]) -> list[FloatArray]:
 
 def _coarse(kind: Kind, p: FloatArray, beams: Beams, sensor: Sensor, step: int) -> Fit:
     """A fit to every ``step``-th beam."""
-    return _fit(kind, p, beams, sensor, COARSE_BLURS, COARSE_STEPS, step)
+    return _fit(kind, p, beams, sensor, COARSE_BLURS, COARSE_STEPS, step, ROUGH)
 
 
 def _ranked(kind: Kind, ways: Sequence[FloatArray], beams: Beams, sensor: Sensor) -> list[tuple[float, FloatArray]]:
@@ -169,7 +169,14 @@ def other_apexes(p: FloatArray) -> list[FloatArray]:
 
 
 def _fit(
-    kind: Kind, p: FloatArray, beams: Beams, sensor: Sensor, blurs: Sequence[float], steps: int, step: int = 1
+    kind: Kind,
+    p: FloatArray,
+    beams: Beams,
+    sensor: Sensor,
+    blurs: Sequence[float],
+    steps: int,
+    step: int = 1,
+    tolerance: float = TOLERANCE,
 ) -> Fit:
     """The nearest best fit of a kind."""
     tie = TIES[kind]
@@ -185,7 +192,7 @@ def _fit(
         sensor.table,
         np.maximum(blurs, sensor.footprint),
         steps,
-        TOLERANCE,
+        tolerance,
         information,
     )
     return Fit(kind, found, cost, information)

@@ -22,7 +22,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mapping.rays import inline, kernel
+from mapping.rays import compiled, inline
+
+kernel = compiled(inline="never", fastmath={"arcp", "contract", "reassoc", "nsz"})
+"""Divisions by what stays the same may become products; infinities and NaN keep their meaning."""
 
 BOX, DISC, TRIANGLE = 0, 1, 2
 """Unit shapes: [-1/2, 1/2]², radius 1, and corners (-1/2, -1/3), (1/2, -1/3), (0, 2/3)."""
@@ -34,7 +37,7 @@ ORIGIN_X, ORIGIN_Y, DIRECTION_X, DIRECTION_Y, RANGE, STOP, MISS = range(7)
 """Columns of beams (N, 7): the ray; the measured range, or the limit it is beyond; from where on (m) something else
 stops it; the logarithm of its likelihood if it misses the shape."""
 
-MEASURED, TOO_NEAR, NO_RETURN = 0, 1, 2
+MEASURED, TOO_NEAR, NO_RETURN, SAYS_NOTHING = 0, 1, 2, 3
 
 TABLE_REACH = 12.0
 TABLE_SPACING = 64
@@ -220,6 +223,24 @@ def share_hit(s: float, blur: float) -> float:
         return 0.0
     u = 0.5 * (s / blur + 1.0)
     return u * u * (3.0 - 2.0 * u)
+
+
+@kernel
+def passing(
+    directions: Any, cos: float, sin: float, x: float, y: float, reach: float, kinds: Any, chosen: Any
+) -> int:
+    """Which beams of a scan that say something come within ``reach`` of (x, y), as seen from the laser; their number.
+
+    ``directions`` (N, 2) are in the laser's frame, turned by (cos, sin); indices are left in ``chosen``.
+    """
+    ahead, aside = cos * x + sin * y, cos * y - sin * x
+    count = 0
+    for i in range(len(directions)):
+        dx, dy = directions[i, 0], directions[i, 1]
+        if abs(dx * aside - dy * ahead) < reach and dx * ahead + dy * aside > -reach and kinds[i] != SAYS_NOTHING:
+            chosen[count] = i
+            count += 1
+    return count
 
 
 @kernel

@@ -17,40 +17,33 @@ again beside the others. The noise is found from the rays on the way. What the r
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from concurrent.futures import Executor, ThreadPoolExecutor
-from dataclasses import dataclass, field, replace
+from collections.abc import Iterable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from detect.beams import (
-    FAMILY,
     Backdrop,
     Beams,
     Sensor,
     backdrop,
-    behind,
     explained,
     gather,
-    in_table,
     parameters,
 )
-from detect.cells import MapCells, circumradius
+from detect.candidates import Candidate, fit_all, look_behind, share_of
+from detect.cells import MapCells
 from detect.detector import Detection, Detections, Rejection
-from detect.evidence import exact_costs, laplace, weighed
-from detect.fit import TIES, Fit, again, primitive_of, search
+from detect.evidence import weighed
+from detect.measure import distance_to, first_noise, measured, measured_noise
 from detect.proposals import proposals
-from detect.raycost import MEASURED, MISS, RANGE, STOP, not_below, trace
-from detect.walls import Wall, walls_behind
+from detect.raycost import MISS, STOP
 from mapping.grid import OccupancyGrid
 from prim.frames import Pose2D, Scan
-from prim.metrics import polygon_areas
 from prim.raycast import FloatArray
 from prim.shapes import Kind, Primitive
-
-WITHIN = 2.5
-"""Others further away than this (m) are not reckoned with: few rays pass both, and say the same of all shapes."""
 
 MOST_DOUBTFUL = 24
 """Of what the networks were unsure of, no more than this is asked the rays about: the best."""
@@ -58,14 +51,10 @@ MOST_DOUBTFUL = 24
 REACH, REACH_FITTED = 0.07, 0.03
 """Rays that come within this (m) of a candidate are looked at: at first, and once it is fitted."""
 
-OUT_OF_QUESTION = 60.0
-"""A kind whose evidence is this much (nats) less than the likeliest one's is not fitted again."""
-
-ROUNDS = 2
-"""So often all candidates are fitted beside each other, once they are told apart."""
-
-LEAST_NOISE = 0.002
-"""Noise (m) below this is not told apart: poses and ranges as logs hold them are no better."""
+ROUNDS, SETTLED = 2, 0.002
+"""So often all candidates are fitted beside each other, once they are told apart; no more where none moves by more
+than this (m, rad).
+"""
 
 LEAST_GAIN = 25.0
 """A primitive makes the rays more likely than an empty place does by at least so much (nats)."""
@@ -97,24 +86,6 @@ SAME = 0.25
 CLEARED_FIRST, CLEARED = 0.03, 0.02
 """So far (m) around a candidate the map's cells are its own, not what stands behind: at first, and once fitted."""
 
-MOVED, MOVED_SHARE = 0.05, 0.1
-"""What stands behind has changed where more than such a share of rays ends elsewhere (m): all is fitted anew."""
-
-FEW = 20
-"""Fewer rays than this do not tell the noise, and fewer scans no dispersion."""
-
-FEW_OF_SCAN = 4
-"""Fewer rays of one scan than this do not tell how far it is off as a whole."""
-
-CLEAR_ERROR = 4.0
-"""A ray that is off by more standard deviations than this met something else."""
-
-FOOTPRINTS = (0.0, 0.0005, 0.001, 0.002, 0.004, 0.008, 0.016)
-"""Footprints (m) that are tried; the first two are taken for none."""
-
-START_NOISE = 0.03
-"""The noise (m) where nothing tells it."""
-
 
 @dataclass(frozen=True)
 class Refined:
@@ -138,43 +109,6 @@ class Refined:
     def score(self) -> float:
         """The chance that the kind is right."""
         return self.chances[self.primitive.kind]
-
-
-@dataclass
-class Candidate:
-    """One thing that is fitted: where it was first seen, the rays around it, and what is known of it by now."""
-
-    start: Primitive
-    beams: Beams
-    cells: MapCells
-    known: Detection | None = None
-    map_behind: Backdrop | None = None
-    walls: list[Wall] = field(default_factory=list)
-    fits: list[Fit] = field(default_factory=list)
-    fitted_to: tuple[Sensor, Beams] | None = None
-
-    def look_at(self, chosen: NDArray[np.bool_]) -> None:
-        """Leaves out all other beams."""
-        self.beams = self.beams.of(chosen)
-        self.map_behind = self.map_behind and self.map_behind.of(chosen)
-        self.fitted_to = self.fitted_to and (self.fitted_to[0], self.fitted_to[1].of(chosen))
-
-    @property
-    def known_fit(self) -> Fit:
-        """The best fit of the kind that it is known to be, or where that begins."""
-        if self.fits:
-            return self.fits[0]
-        kind = self.start.kind
-        return Fit(kind, parameters(self.start), 0.0, np.eye(TIES[kind].shape[1]))
-
-    def may_be(self, primitive: Primitive) -> bool:
-        """Whether a primitive keeps off the walls behind it."""
-        return not self.cells.is_pierced_by(primitive) and not any(wall.is_cut_by(primitive) for wall in self.walls)
-
-    @property
-    def now(self) -> Primitive:
-        """The best that is known of it."""
-        return primitive_of(self.fits[0].kind, self.fits[0].p) if self.fits else self.start
 
 
 def refine_detections(
@@ -221,9 +155,9 @@ def _known_before(wanted: Sequence[Detection], before: Detections | None) -> dic
     sure = [one for one in (before.found if before else ()) if one.score >= SURE]
     known = {}
     for number, one in enumerate(wanted):
-        same = [other for other in sure if _share(one.primitive, other.primitive) > LEAST_SHARED]
+        same = [other for other in sure if share_of(one.primitive, other.primitive) > LEAST_SHARED]
         if same:
-            known[number] = max(same, key=lambda other: _share(one.primitive, other.primitive))
+            known[number] = max(same, key=lambda other: share_of(one.primitive, other.primitive))
     return known
 
 
@@ -255,7 +189,7 @@ def doubt(made: Refined | None, guess: Primitive, cells: MapCells) -> str:
         return f"{before}only {made.seen:.0%} of its outline is seen, less than {LEAST_SEEN:.0%}"
     if cells.is_touched_by(made.primitive):
         return f"{before}it reaches into a wall"
-    if _share(made.primitive, guess) < LEAST_SHARED:
+    if share_of(made.primitive, guess) < LEAST_SHARED:
         return f"{before}what explains its rays stands elsewhere"
     if made.score < LEAST_SURE:
         return f"{before}its kind is sure by {made.score:.2f} only, less than {LEAST_SURE:g}"
@@ -309,8 +243,11 @@ def refine(
             return [None] * len(primitives), noise_std
         sensor = Sensor.of(noise_std or measured_noise(alone, sensor), span, most=most)
         for _ in range(ROUNDS):
+            where = [parameters(one.now) for one in alone]
             changed = look_behind(alone, cells, CLEARED)
             fit_all(pool, alone, changed, sensor)
+            if all(np.abs(parameters(one.now) - at).max() < SETTLED for one, at in zip(alone, where, strict=True)):
+                break
         sensor = measured(alone, sensor, noise_std)
         fit_all(pool, alone, [False] * len(alone), sensor)
         whole = [backdrop(one.beams, cells.occupied, cells.frame) for one in alone]
@@ -319,192 +256,20 @@ def refine(
     return [made.get(id(one)) for one in candidates], sensor.std
 
 
-def fit_all(pool: Executor, candidates: Sequence[Candidate], anew: Sequence[bool], sensor: Sensor) -> None:
-    """Fits all candidates beside what was known of the others before: ``anew``, or from where they are.
-
-    Where hardly anything has changed behind and before a candidate, it stays as it is.
-    """
-    beams = [before_others(one, candidates, sensor) for one in candidates]
-    list(pool.map(lambda one, own, new: _fit_one(one, own, sensor, new), candidates, beams, anew))
-
-
-def _fit_one(candidate: Candidate, beams: Beams, sensor: Sensor, anew: bool) -> None:
-    """Leaves a candidate's kinds, likeliest first, as far as a Gaussian tells their evidence."""
-    before = candidate.fitted_to
-    if candidate.known is not None:
-        fits = again([candidate.known_fit], beams, sensor)
-    elif anew or before is None:
-        fits = search(candidate.now, beams, sensor)
-    elif before[0] is sensor and before[1].much_alike(beams):
-        return
-    else:
-        fits = again(candidate.fits, beams, sensor)
-    possible = [fit for fit in fits if candidate.may_be(primitive_of(fit.kind, fit.p))]
-    ordered = sorted(possible or fits, key=lambda fit: -laplace(fit))
-    candidate.fits = [fit for fit in ordered if laplace(fit) > laplace(ordered[0]) - OUT_OF_QUESTION]
-    candidate.fitted_to = sensor, beams
-
-
-def look_behind(candidates: Sequence[Candidate], cells: MapCells, margin: float) -> list[bool]:
-    """Reads from the map what stands behind each candidate: the map without their own cells.
-
-    Whose cells are a candidate's is better known the second time; returns for which that changed much.
-    """
-    shapes = [one.now for one in candidates]
-    occupied = cells.without(shapes, margin)
-    walls = walls_behind(cells, shapes, [one.beams.rays[:, :2].mean(axis=0) for one in candidates])
-    for wall in walls:
-        occupied[wall.cells] = False
-    changed = []
-    for one in candidates:
-        before = one.map_behind
-        one.map_behind = backdrop(one.beams, occupied, cells.frame)
-        one.walls = [wall for wall in walls if _apart(wall.stretch, one.start) < WITHIN]
-        moved = before is None or np.mean(np.abs(before.stops - one.map_behind.stops) > MOVED) > MOVED_SHARE
-        changed.append(bool(moved))
-    return changed
-
-
-def first_noise(candidates: Sequence[Candidate]) -> float:
-    """A first guess (m) of the noise: how far ranges are from where the starts would stop them, robustly."""
-    residuals = np.concatenate([_residuals(one.beams, one.start) for one in candidates])
-    if len(residuals) < 10:
-        return START_NOISE
-    return max(1.4826 * float(np.median(np.abs(residuals))), LEAST_NOISE, 0.005)
-
-
-def _residuals(beams: Beams, primitive: Primitive) -> FloatArray:
-    """How far (m) measured ranges are from a primitive that their rays meet."""
-    distance = _distance(primitive, beams)
-    hit = (distance < beams.far) & (beams.kinds == MEASURED)
-    return np.asarray(beams.rays[hit, RANGE] - distance[hit])
-
-
-def measured(candidates: Sequence[Candidate], sensor: Sensor, noise_std: float | None) -> Sensor:
-    """What the candidates' rays tell of the sensor: its noise where it is not given, footprint and dispersion."""
-    std = noise_std or measured_noise(candidates, sensor)
-    sensor = Sensor.of(std, sensor.span, sensor.footprint, most=sensor.most)
-    footprint = measured_footprint(candidates, sensor)
-    return Sensor.of(std, sensor.span, footprint, measured_dispersion(candidates, sensor), sensor.most)
-
-
-def measured_footprint(candidates: Sequence[Candidate], sensor: Sensor) -> float:
-    """The footprint (m) that makes the rays most likely which pass candidates' edges."""
-    totals = np.zeros(len(FOOTPRINTS))
-    for one in candidates:
-        beams, fit = before_others(one, candidates, sensor), one.fits[0]
-        for k, footprint in enumerate(FOOTPRINTS):
-            totals[k] += exact_costs(fit.kind, fit.p[None], beams, replace(sensor, footprint=footprint))[0]
-    return float(FOOTPRINTS[best]) if (best := int(np.argmin(totals))) > 1 else 0.0
-
-
-def measured_dispersion(candidates: Sequence[Candidate], sensor: Sensor) -> float:
-    """By how much the squared mean errors of scans' rays exceed what independent rays would make them; 1 at least."""
-    squares, scans = 0.0, 0
-    for one in candidates:
-        beams = before_others(one, candidates, sensor)
-        distance = _distance(one.now, beams)
-        error = (beams.rays[:, RANGE] - distance) / sensor.std
-        clear = (distance < beams.rays[:, STOP]) & (beams.kinds == MEASURED) & (np.abs(error) < CLEAR_ERROR)
-        error = _without_cut(error, np.minimum((beams.far - sensor.span - distance) / sensor.std, 0.0))
-        count = np.bincount(beams.scan[clear])
-        total = np.bincount(beams.scan[clear], error[clear])
-        many = count >= FEW_OF_SCAN
-        squares += float((total[many] ** 2 / count[many]).sum())
-        scans += int(np.count_nonzero(many))
-    return max(squares / scans, 1.0) if scans >= FEW else 1.0
-
-
-def _without_cut(error: FloatArray, cut: FloatArray) -> FloatArray:
-    """Errors (in standard deviations) of a normal distribution that ends at ``cut``, with mean 0 and variance 1."""
-    tail = np.exp(-(cut**2) / 2) / math.sqrt(2 * math.pi) / not_below(cut)
-    return np.asarray((error - tail) / np.sqrt(1 + cut * tail - tail**2))
-
-
-def _distance(primitive: Primitive, beams: Beams) -> FloatArray:
-    """Where (m) beams meet a primitive; FAR where they do not."""
-    distance = np.empty(len(beams))
-    trace(FAMILY[primitive.kind], parameters(primitive), beams.rays, distance)
-    return distance
-
-
-def measured_noise(candidates: Sequence[Candidate], sensor: Sensor) -> float:
-    """The noise (m) that makes the rays which meet candidates most likely, those that were cut off among them."""
-    met = [_met(one, before_others(one, candidates, sensor)) for one in candidates]
-    distance, kinds, z = (np.concatenate(part) for part in zip(*met, strict=True))
-    count = int(np.count_nonzero(kinds == MEASURED))
-    if count < FEW:
-        return sensor.std
-
-    def cost(log_std: float) -> float:
-        std = math.exp(log_std)
-        table = Sensor.of(std, sensor.span).table
-        return count * log_std - float(in_table(table, kinds, (distance - z) / std).sum())
-
-    return min(max(math.exp(_least(cost, math.log(sensor.std))), LEAST_NOISE), sensor.most)
-
-
-def _met(candidate: Candidate, beams: Beams) -> tuple[FloatArray, NDArray[np.int8], FloatArray]:
-    """Where (m) beams meet a candidate, what they measured (kind), and the range or its limit (m)."""
-    distance = _distance(candidate.now, beams)
-    meets = (distance < beams.rays[:, STOP]) & (distance < beams.far)
-    return distance[meets], beams.kinds[meets], beams.rays[meets, RANGE]
-
-
-def _least(cost: Callable[[float], float], at: float, step: float = 0.5) -> float:
-    """Where a function of one valley is least: stepped down to, then a parabola through three points, twice."""
-    here = cost(at)
-    for _ in range(12):
-        left, right = cost(at - step), cost(at + step)
-        if min(left, right) >= here:
-            curve = left + right - 2 * here
-            at += 0.5 * step * (left - right) / curve if curve > 0 else 0.0
-            if step < 0.1:
-                return at
-            step, here = step / 6, cost(at)
-        elif left < right:
-            at, here = at - step, left
-        else:
-            at, here = at + step, right
-    return at
-
-
-def before_others(candidate: Candidate, among: Sequence[Candidate], sensor: Sensor) -> Beams:
-    """A candidate's beams, with what they say where they miss it."""
-    others = [one.now for one in among if one is not candidate and _apart(one.start, candidate.start) < WITHIN]
-    assert candidate.map_behind is not None
-    return behind(
-        candidate.beams, candidate.map_behind, [*others, *(wall.stretch for wall in candidate.walls)], sensor
-    )
-
-
 def _once(candidates: Sequence[Candidate], sensor: Sensor) -> list[Candidate]:
     """The candidates without those that stand where a likelier one does."""
     gains = {id(one): gain_of(one, candidates, sensor) for one in candidates}
     stay: list[Candidate] = []
     for one in sorted(candidates, key=lambda one: -gains[id(one)]):
-        if all(_share(one.now, other.now) <= SAME for other in stay):
+        if all(share_of(one.now, other.now) <= SAME for other in stay):
             stay.append(one)
     return stay
 
 
 def gain_of(candidate: Candidate, among: Sequence[Candidate], sensor: Sensor) -> float:
     """By how much (nats) the rays are likelier with the candidate than with nothing in its place."""
-    beams = before_others(candidate, among, sensor)
+    beams = candidate.seen_before(among, sensor)
     return float(-beams.rays[:, MISS].sum() - candidate.fits[0].cost)
-
-
-def _apart(a: Primitive, b: Primitive) -> float:
-    """How far (m) two primitives' middles are from each other."""
-    return math.hypot(a.x - b.x, a.y - b.y)
-
-
-def _share(a: Primitive, b: Primitive) -> float:
-    """How much two primitives share, of the smaller one's area."""
-    if _apart(a, b) > circumradius(a) + circumradius(b):
-        return 0.0
-    first, second, shared = polygon_areas(a, b)
-    return shared / min(first, second)
 
 
 def finish(candidate: Candidate, map_alone: Backdrop, sensor: Sensor) -> Refined | None:
@@ -526,7 +291,7 @@ def _held_against_map(
     """Of the rays that meet a primitive: by how much (nats each) the map explains them better, how many they are, and
     in what share of the directions around it they meet it.
     """
-    distance = _distance(primitive, beams)
+    distance = distance_to(primitive, beams)
     meets = distance < beams.rays[:, STOP]
     if not meets.any():
         return 0.0, 0, 0.0

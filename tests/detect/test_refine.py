@@ -10,7 +10,7 @@ import pytest
 from hypothesis import assume, given
 from hypothesis import strategies as st
 
-from detect.beams import MOST, Gatherer, Sensor, behind, gather, parameters
+from detect.beams import MOST, Gatherer, Sensor, backdrop, before, gather, map_says, parameters
 from detect.cells import MapCells, OneSided, is_within
 from detect.detector import Detection, Detections, Rejection
 from detect.evidence import exact_costs
@@ -228,12 +228,11 @@ def test_behind_a_primitive_stands_what_the_map_and_the_others_say() -> None:
     world = room(shape(Kind.CIRCLE), shape(Kind.SQUARE, 0.5, 0.0))
     taken = scans(world, 0.0)
     (around,), span, _ = gather(taken, [world.primitives[0]], 0.05)
-    from detect.beams import backdrop
-
     cells = MapCells.of(mapped(taken))
     sensor = Sensor.of(0.01, span)
     occupied = cells.without(world.primitives, 0.02)
-    beams = behind(around, backdrop(around, occupied, cells.frame), [world.primitives[1]], sensor)
+    behind = backdrop(around, occupied, cells.frame)
+    beams = before(around, behind, map_says(around, behind, sensor), [world.primitives[1]], sensor)
     exact = world.cast((0.0, 0.0), np.array([[1.0, 0.0]]))
     assert len(beams) and np.isfinite(beams.rays).all() and exact[0] > 0
     right = exact_costs(Kind.CIRCLE, parameters(world.primitives[0])[None], beams, sensor)[0]

@@ -1,0 +1,144 @@
+"""Candidates: the things that refinement fits, each beside what is known of the others."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from concurrent.futures import Executor
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from detect.beams import Backdrop, Beams, Sensor, backdrop, before, map_says, parameters
+from detect.cells import MapCells, circumradius
+from detect.detector import Detection
+from detect.evidence import laplace
+from detect.fit import TIES, Fit, again, primitive_of, search
+from detect.walls import Wall, walls_behind
+from prim.metrics import polygon_areas
+from prim.raycast import FloatArray
+from prim.shapes import Primitive
+
+WITHIN = 2.5
+"""Others further away than this (m) are not reckoned with: few rays pass both, and say the same of all shapes."""
+
+OUT_OF_QUESTION = 30.0
+"""A kind whose evidence is this much (nats) less than the likeliest one's is not fitted again."""
+
+MOVED, MOVED_SHARE = 0.05, 0.1
+"""What stands behind has changed where more than such a share of rays ends elsewhere (m): all is fitted anew."""
+
+SAME_NOISE = 0.03
+"""Noise that differs by less than this share is the same: nothing is fitted again for it."""
+
+
+@dataclass
+class Candidate:
+    """One thing that is fitted: where it was first seen, the rays around it, and what is known of it by now."""
+
+    start: Primitive
+    beams: Beams
+    cells: MapCells
+    known: Detection | None = None
+    map_behind: Backdrop | None = None
+    walls: list[Wall] = field(default_factory=list)
+    fits: list[Fit] = field(default_factory=list)
+    fitted_to: tuple[Sensor, Beams] | None = None
+    said: tuple[Backdrop, float, FloatArray] | None = None
+
+    def seen_before(self, others: Sequence[Candidate], sensor: Sensor) -> Beams:
+        """Its beams, with what they say where they miss it: of the map, of walls, and of the other candidates."""
+        behind = self.map_behind
+        assert behind is not None
+        if self.said is None or self.said[0] is not behind or self.said[1] != sensor.std:
+            self.said = behind, sensor.std, map_says(self.beams, behind, sensor)
+        shapes = [one.now for one in others if one is not self and apart(one.start, self.start) < WITHIN]
+        return before(self.beams, behind, self.said[2], [*shapes, *(wall.stretch for wall in self.walls)], sensor)
+
+    def look_at(self, chosen: NDArray[np.bool_]) -> None:
+        """Leaves out all other beams."""
+        self.beams = self.beams.of(chosen)
+        self.map_behind = self.map_behind and self.map_behind.of(chosen)
+        self.fitted_to = self.fitted_to and (self.fitted_to[0], self.fitted_to[1].of(chosen))
+
+    @property
+    def known_fit(self) -> Fit:
+        """The best fit of the kind that it is known to be, or where that begins."""
+        if self.fits:
+            return self.fits[0]
+        kind = self.start.kind
+        return Fit(kind, parameters(self.start), 0.0, np.eye(TIES[kind].shape[1]))
+
+    def may_be(self, primitive: Primitive) -> bool:
+        """Whether a primitive keeps off the walls behind it."""
+        return not self.cells.is_pierced_by(primitive) and not any(wall.is_cut_by(primitive) for wall in self.walls)
+
+    @property
+    def now(self) -> Primitive:
+        """The best that is known of it."""
+        return primitive_of(self.fits[0].kind, self.fits[0].p) if self.fits else self.start
+
+
+def fit_all(pool: Executor, candidates: Sequence[Candidate], anew: Sequence[bool], sensor: Sensor) -> None:
+    """Fits all candidates beside what was known of the others before: ``anew``, or from where they are.
+
+    Where hardly anything has changed behind and before a candidate, it stays as it is.
+    """
+    beams = [one.seen_before(candidates, sensor) for one in candidates]
+    list(pool.map(lambda one, own, new: _fit_one(one, own, sensor, new), candidates, beams, anew))
+
+
+def _fit_one(candidate: Candidate, beams: Beams, sensor: Sensor, anew: bool) -> None:
+    """Leaves a candidate's kinds, likeliest first, as far as a Gaussian tells their evidence."""
+    before = candidate.fitted_to
+    if candidate.known is not None:
+        fits = again([candidate.known_fit], beams, sensor)
+    elif anew or before is None:
+        fits = search(candidate.now, beams, sensor)
+    elif _much_alike(before[0], sensor) and before[1].much_alike(beams):
+        return
+    else:
+        fits = again(candidate.fits, beams, sensor)
+    possible = [fit for fit in fits if candidate.may_be(primitive_of(fit.kind, fit.p))]
+    ordered = sorted(possible or fits, key=lambda fit: -laplace(fit))
+    candidate.fits = [fit for fit in ordered if laplace(fit) > laplace(ordered[0]) - OUT_OF_QUESTION]
+    candidate.fitted_to = sensor, beams
+
+
+def _much_alike(one: Sensor, other: Sensor) -> bool:
+    """Whether fits for one sensor need not be made again for another."""
+    return abs(one.std - other.std) < SAME_NOISE * other.std and one.footprint == other.footprint
+
+
+def look_behind(candidates: Sequence[Candidate], cells: MapCells, margin: float) -> list[bool]:
+    """Reads from the map what stands behind each candidate: the map without their own cells.
+
+    Whose cells are a candidate's is better known the second time; returns for which that changed much.
+    """
+    shapes = [one.now for one in candidates]
+    occupied = cells.without(shapes, margin)
+    walls = walls_behind(cells, shapes, [one.beams.rays[:, :2].mean(axis=0) for one in candidates])
+    for wall in walls:
+        occupied[wall.cells] = False
+    changed = []
+    for one in candidates:
+        before = one.map_behind
+        one.map_behind = backdrop(one.beams, occupied, cells.frame)
+        one.walls = [wall for wall in walls if apart(wall.stretch, one.start) < WITHIN]
+        moved = before is None or np.mean(np.abs(before.stops - one.map_behind.stops) > MOVED) > MOVED_SHARE
+        changed.append(bool(moved))
+    return changed
+
+
+def apart(a: Primitive, b: Primitive) -> float:
+    """How far (m) two primitives' middles are from each other."""
+    return math.hypot(a.x - b.x, a.y - b.y)
+
+
+def share_of(a: Primitive, b: Primitive) -> float:
+    """How much two primitives share, of the smaller one's area."""
+    if apart(a, b) > circumradius(a) + circumradius(b):
+        return 0.0
+    first, second, shared = polygon_areas(a, b)
+    return shared / min(first, second)
