@@ -22,14 +22,14 @@ CONTENDER = 7.0
 LONGEST = 0.7
 """Sizes are taken to be even up to this (m), before the rays are asked."""
 
-SAMPLES = (240, 240, 480)
+SAMPLES = (300, 300, 600)
 DEGREES = 6.0
 """So many samples are drawn in each round, from Student's t with so many degrees of freedom: its tails are heavy."""
 
 EFFECTIVE = 0.15
 """In all rounds but the last, weights are made more alike until this share of the samples counts."""
 
-LEAST_EFFECTIVE = 0.04
+LEAST_EFFECTIVE = 0.06
 """So are they in the last, until this share does: where fewer would, they would tell too small a spread."""
 
 LEAST_STD = (1e-4, 1e-4, 1e-3, 1e-4, 1e-4)
