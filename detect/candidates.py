@@ -14,7 +14,7 @@ from detect.beams import Backdrop, Beams, Sensor, backdrop, before, map_says, pa
 from detect.cells import MapCells, circumradius
 from detect.detector import Detection
 from detect.evidence import laplace
-from detect.fit import TIES, Fit, again, primitive_of, search
+from detect.fit import SIMPLER, TIES, Fit, again, primitive_of, search
 from detect.walls import Wall, walls_behind
 from prim.metrics import polygon_areas
 from prim.raycast import FloatArray
@@ -102,7 +102,8 @@ def _fit_one(candidate: Candidate, beams: Beams, sensor: Sensor, anew: bool) -> 
         fits = again(candidate.fits, beams, sensor)
     possible = [fit for fit in fits if candidate.may_be(primitive_of(fit.kind, fit.p))]
     ordered = sorted(possible or fits, key=lambda fit: -laplace(fit))
-    candidate.fits = [fit for fit in ordered if laplace(fit) > laplace(ordered[0]) - OUT_OF_QUESTION]
+    likely = {fit.kind for fit in ordered if laplace(fit) > laplace(ordered[0]) - OUT_OF_QUESTION}
+    candidate.fits = [fit for fit in ordered if fit.kind in likely | {SIMPLER.get(kind) for kind in likely}]
     candidate.fitted_to = sensor, beams
 
 

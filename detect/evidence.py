@@ -4,17 +4,20 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
 
 from detect.beams import FAMILY, Beams, Sensor
-from detect.fit import NAMES, TIES, Fit, primitive_of
+from detect.fit import NAMES, SIMPLER, TIES, Fit, primitive_of
 from detect.raycost import MISS, PARAMETERS, costs, margins, slopes
 from prim.raycast import FloatArray
 from prim.shapes import SIZE_KEYS, Kind, Primitive
+
+SAME_SIZES = 0.0005
+"""Sizes that differ by less than this (m) are the same: no thing is made, and no pose known, better."""
 
 CONTENDER = 7.0
 """Kinds whose evidence is within this (nats) of the best one's are sampled."""
@@ -235,12 +238,32 @@ def weighed(fits: Sequence[Fit], beams: Beams, sensor: Sensor) -> Weighed | None
     rough = {fit.kind: laplace(fit, sensor.dispersion) for fit in fits}
     top = max(rough.values())
     sampled = {fit.kind: sample(fit, beams, sensor) for fit in fits if rough[fit.kind] > top - CONTENDER}
+    sampled |= _simpler_ones(fits, sampled, beams, sensor)
     kind = max(sampled, key=lambda one: sampled[one].evidence)
     best = sampled[kind].evidence
     weights = {one: math.exp(sampled[one].evidence - best if one in sampled else rough[one] - top) for one in rough}
     chances = {one: weights.get(one, 0.0) / sum(weights.values()) for one in Kind}
     primitive, std, covariance = told(kind, sampled[kind])
     return Weighed(primitive, std, covariance, chances, sampled[kind].cost)
+
+
+def _simpler_ones(
+    fits: Sequence[Fit], sampled: Mapping[Kind, Sampled], beams: Beams, sensor: Sensor
+) -> dict[Kind, Sampled]:
+    """Squares and circles for rectangles and ellipses whose sizes are the SAME_SIZES: these are no other kind.
+
+    The simpler one gets all the evidence of both.
+    """
+    made = {}
+    for kind, simpler in SIMPLER.items():
+        fit = next((one for one in fits if one.kind is simpler), None)
+        if fit is None or kind not in sampled or abs(sampled[kind].mean[3] - sampled[kind].mean[4]) > SAME_SIZES:
+            continue
+        simple = sampled.get(simpler) or sample(fit, beams, sensor)
+        both = np.logaddexp(simple.evidence, sampled[kind].evidence)
+        made[simpler] = replace(simple, evidence=float(both))
+        made[kind] = replace(sampled[kind], evidence=-math.inf)
+    return made
 
 
 def told(kind: Kind, made: Sampled) -> tuple[Primitive, dict[str, float], FloatArray]:
