@@ -159,6 +159,9 @@ def cnn(
     epochs: Annotated[
         int | None, typer.Option(metavar="N", help="Passes over the set. [default: the preset's]")
     ] = None,
+    start: Annotated[
+        Path | None, typer.Option(metavar="W", help="Weights to begin from: a checkpoint, or an exported .onnx.")
+    ] = None,
     seed: Annotated[int, typer.Option(metavar="N", help="What the weights begin from.")] = 0,
     quiet: Annotated[bool, typer.Option("--quiet", help="Print errors only.")] = False,
     debug: Annotated[bool, typer.Option("--debug", help="Show tracebacks.")] = False,
@@ -171,7 +174,7 @@ def cnn(
     from detect.train import CNN_PRESETS, checkpoint_name, networks_of, train_cnn
     from prim.shapes import Kind
 
-    options = dataclasses.replace(CNN_PRESETS[preset.value], seed=seed)
+    options = dataclasses.replace(CNN_PRESETS[preset.value], seed=seed, start=start)
     if epochs is not None:
         options = dataclasses.replace(options, epochs=epochs)
     output.mkdir(parents=True, exist_ok=True)
@@ -198,7 +201,9 @@ def yolo(
     epochs: Annotated[
         int | None, typer.Option(metavar="N", help="Passes over the set. [default: the preset's]")
     ] = None,
-    start: Annotated[Path | None, typer.Option(metavar="W.pt", help="Weights to begin from.")] = None,
+    start: Annotated[
+        Path | None, typer.Option(metavar="W", help="Weights to begin from: a .pt, or an exported .onnx.")
+    ] = None,
     trust: Annotated[bool, typer.Option("--trust", help="A .pt is a pickle that can run code: run it.")] = False,
     seed: Annotated[int, typer.Option(metavar="N", help="What the weights begin from.")] = 0,
     debug: Annotated[bool, typer.Option("--debug", help="Show tracebacks.")] = False,

@@ -76,6 +76,13 @@ def test_weights_that_can_run_code_must_be_trusted(run: Run) -> None:
     assert code == 2 and "--trust" in err
 
 
+def test_exported_weights_need_no_trust(run: Run) -> None:
+    """They cannot run code; the set is asked for next."""
+    pytest.importorskip("torch", reason="needs the extra [train]")
+    code, _, err = run("yolo", "set", "out", "--start", "a.onnx")
+    assert code == 2 and "--trust" not in err and "holds no set" in err
+
+
 def test_a_network_learns_and_goes_on(run: Run) -> None:
     pytest.importorskip("torch", reason="needs the extra [train]")
     run("dataset", "set", "--maps", 6, 2, "--mapper", "prob", "--kind", "circle", "--noise-std", 0.0)
