@@ -227,6 +227,8 @@ def _plot(results: Sequence[Result], path: Path) -> None:
                 own = [
                     (c, f) for c, f, _ in results if (c.reading, c.row.mapper, c.row.train) == (reading, mapper, 0.05)
                 ]
+                if not own:
+                    continue
                 at = [case.row.test for case, _ in own]
                 axis.plot(at, [f["boxes"]["all"][name] for _, f in own], "o-", color=colour, label=mapper)
                 paper = [_paper(case.row, "all")[0].get(name) for case, _ in own]
