@@ -43,6 +43,9 @@ MOST_NOISE, LEAST_MOST = 2.0, 0.01
 is less than so much (m) is not held against it.
 """
 
+FARTHEST = 1000.0
+"""A sensor that says it sees further (m), or without end, is taken to see so far."""
+
 OUTLIERS = 0.005
 """The share of ranges that have nothing to do with what stands there; spread evenly over all ranges."""
 
@@ -159,7 +162,7 @@ class Gatherer:
         near = np.flatnonzero(away - self._reach < scan.range_max)
         if not len(near):
             return
-        self.span = max(self.span, scan.range_max - scan.range_min)
+        self.span = max(self.span, min(scan.range_max, FARTHEST) - scan.range_min)
         kinds, z = _measurements(scan)
         chosen = np.empty(len(z), np.int64)
         cos, sin = math.cos(pose.theta), math.sin(pose.theta)
@@ -189,7 +192,7 @@ class Gatherer:
         rays[:, :2] = pose.x, pose.y
         rays[:, 2:4] = directions
         rays[:, RANGE] = z[chosen]
-        far, number = np.full(len(chosen), scan.range_max), np.full(len(chosen), self._count, np.int32)
+        far, number = np.full(len(chosen), min(scan.range_max, FARTHEST)), np.full(len(chosen), self._count, np.int32)
         return Beams(rays, kinds[chosen], directions @ towards - reach, far, number)
 
     def _keep(self, k: int, beams: Beams) -> None:

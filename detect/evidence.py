@@ -100,6 +100,8 @@ def sample(fit: Fit, beams: Beams, sensor: Sensor) -> Sampled:
         points = mean + standard @ lower.T
         cost = split.costs(points @ tie.T)
         log_weight = -cost / sensor.dispersion - log_density + np.log(np.diag(lower)).sum()
+        if not np.isfinite(log_weight).any():  # none of them is a primitive of a size that is looked for
+            return Sampled(at, spread, -math.inf, fit.cost, 0.0)
         weight = np.exp(log_weight - log_weight.max())
         share = _tempered(weight, EFFECTIVE if count < len(rounds) else LEAST_EFFECTIVE)
         mean = share @ points
@@ -241,6 +243,8 @@ def weighed(fits: Sequence[Fit], beams: Beams, sensor: Sensor) -> Weighed | None
     sampled |= _simpler_ones(fits, sampled, beams, sensor)
     kind = max(sampled, key=lambda one: sampled[one].evidence)
     best = sampled[kind].evidence
+    if best == -math.inf:
+        return None
     weights = {one: math.exp(sampled[one].evidence - best if one in sampled else rough[one] - top) for one in rough}
     chances = {one: weights.get(one, 0.0) / sum(weights.values()) for one in Kind}
     primitive, std, covariance = told(kind, sampled[kind])

@@ -206,6 +206,24 @@ def test_scans_that_say_nothing(ranges: np.ndarray) -> None:
     assert not refined.found and len(refined.rejected) == 1
 
 
+def test_a_sensor_that_sees_without_end(exact: tuple[World, list[tuple[Scan, Pose2D]], OccupancyGrid]) -> None:
+    world, taken, grid = exact
+    endless = [(replace(scan, range_max=math.inf), pose) for scan, pose in taken]
+    refined, noise = refine([world.primitives[0]], endless, MapCells.of(grid))
+    assert refined[0] is not None and refined[0].primitive.kind is Kind.SQUARE and noise is not None
+    assert all(math.isfinite(value) and value > 0 for value in refined[0].std.values())
+
+
+def test_what_is_larger_than_any_primitive_is_none(
+    exact: tuple[World, list[tuple[Scan, Pose2D]], OccupancyGrid],
+) -> None:
+    _, taken, grid = exact
+    for size in ((0.69, 0.69), (1.1, 0.9)):
+        large = Primitive(Kind.RECTANGLE, 0.0, 0.0, 0.0, size)
+        refined, _ = refine_detections(Detections((found(large),), ()), taken, grid)
+        assert all(max(one.primitive.size) < 0.7 for one in refined.found)
+
+
 def test_nothing_to_refine(exact: tuple[World, list[tuple[Scan, Pose2D]], OccupancyGrid]) -> None:
     _, _, grid = exact
     assert refine([], [], MapCells.of(grid)) == ([], None)
