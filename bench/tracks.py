@@ -1,6 +1,6 @@
 """Ids over driven sessions: does each primitive keep one from its first confirmed detection on?
 
-    python -m bench.tracks [--sessions 50] [--mapper forward] [--every 20] [--update docs/refine.md]
+    python -m bench.tracks [--sessions 50] [--mapper forward] [--every 20] [--update docs/detect.md]
 
 Sessions are driven for 40 s (seeds from 70000), poses are exact, noise is 50 mm; the detector looks every 20 scans.
 A primitive is kept where all confirmed detections of it (outlines overlap by half) have the id of the first; false

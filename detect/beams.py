@@ -20,6 +20,7 @@ from detect.raycost import (
     RANGE,
     SAYS_NOTHING,
     STOP,
+    TABLE_SPACING,
     TOO_NEAR,
     TRIANGLE,
     pass_by,
@@ -208,7 +209,7 @@ class Gatherer:
     def most_noise(self) -> float:
         """The noise (m) is no larger than this: neighbouring beams of some scans would differ by more."""
         guess = neighbour_noise(np.concatenate(self._ranges)) if self._ranges else None
-        return max(MOST_NOISE * guess, LEAST_MOST) if guess else math.inf
+        return max(MOST_NOISE * guess, LEAST_MOST) if guess is not None else math.inf
 
     def beams(self) -> list[Beams]:
         """Each circle's rays."""
@@ -297,7 +298,7 @@ def _shorten(nearest: FloatArray, beams: Beams, other: Primitive) -> None:
 def in_table(table: FloatArray, kinds: NDArray[np.int8], x: FloatArray) -> FloatArray:
     """Log-likelihoods (N,) at x (N,), to the nearest entry of the table."""
     reach = (table.shape[1] - 1) / 2
-    place = np.clip(np.rint(x * 64 + reach), 0, 2 * reach).astype(np.intp)
+    place = np.clip(np.rint(x * TABLE_SPACING + reach), 0, 2 * reach).astype(np.intp)
     return np.asarray(table[kinds, place])
 
 

@@ -72,7 +72,8 @@ class Candidate:
 
     def may_be(self, primitive: Primitive) -> bool:
         """Whether a primitive keeps off the walls behind it."""
-        return not self.cells.is_pierced_by(primitive) and not any(wall.is_cut_by(primitive) for wall in self.walls)
+        own = (wall for wall in self.walls if wall.behind is self.start)
+        return not self.cells.is_pierced_by(primitive) and not any(wall.is_cut_by(primitive) for wall in own)
 
     @property
     def now(self) -> Primitive:
@@ -119,7 +120,7 @@ def look_behind(candidates: Sequence[Candidate], cells: MapCells, margin: float)
     """
     shapes = [one.now for one in candidates]
     occupied = cells.without(shapes, margin)
-    walls = walls_behind(cells, shapes, [one.beams.rays[:, :2].mean(axis=0) for one in candidates])
+    walls = walls_behind(cells, shapes, [one.start for one in candidates])
     for wall in walls:
         occupied[wall.cells] = False
     changed = []

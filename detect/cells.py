@@ -158,19 +158,25 @@ def _along_lines(grid: OccupancyGrid) -> tuple[BoolGrid, list[OneSided]]:
     one_sided = []
     for line in find_lines(surface, resolution, LEAST_WALL, MOST_WALLS):
         nx, ny, d = line
+        off, along = points @ np.array([nx, ny]) - d, points @ np.array([-ny, nx])
+        thin = WALL_CELLS * resolution
         on_it = surface[np.abs(surface @ np.array([nx, ny]) - d) < resolution]
         side = _free_side(line, on_it, free, resolution)
-        off, along = points @ np.array([nx, ny]) - d, points @ np.array([-ny, nx])
-        ends = on_it @ np.array([-ny, nx])
-        thin = WALL_CELLS * resolution
-        beside = (along > ends.min() - thin) & (along < ends.max() + thin)
+        first, last = _ends(on_it, line)
+        beside = (along > first - thin) & (along < last + thin)
         near |= beside & (off > (-THICK if side > 0 else -thin)) & (off < (THICK if side < 0 else thin))
         if side:
-            first, last = sorted((side * float(ends.min()), side * float(ends.max())))
-            one_sided.append(OneSided((side * nx, side * ny, side * d), first, last))
+            ends = sorted((side * first, side * last))
+            one_sided.append(OneSided((side * nx, side * ny, side * d), ends[0], ends[1]))
     walls = np.zeros_like(grid.occupied)
     walls[rows[near], cols[near]] = True
     return walls, one_sided
+
+
+def _ends(on_it: FloatArray, line: Line) -> tuple[float, float]:
+    """From where to where (m, along a line) points on it go."""
+    along = on_it @ np.array([-line[1], line[0]])
+    return float(along.min()), float(along.max())
 
 
 def _free_side(line: Line, on_it: FloatArray, free: FloatArray, resolution: float) -> float:

@@ -24,6 +24,9 @@ from prim.shapes import Kind, Primitive
 DOUBTFUL = 0.08
 """What scores less than its kind's threshold, but this much at least, is left to the rays to judge."""
 
+MOST_DOUBTFUL = 24
+"""No more than so many are: the best."""
+
 FLOOR = 0.05
 """What YOLO gives a lower score than this is no candidate."""
 
@@ -194,7 +197,8 @@ def _doubtful(boxes: Boxes, among: NDArray[np.bool_], kept: NDArray[np.intp]) ->
     among = among & (boxes.score >= DOUBTFUL)
     for i in kept.tolist():
         among &= overlap(boxes.box[i], boxes.box) <= OVERLAP_LIMIT
-    return np.flatnonzero(suppress(boxes, OVERLAP_LIMIT, among=among) == np.arange(len(boxes)))
+    best = np.flatnonzero(suppress(boxes, OVERLAP_LIMIT, among=among) == np.arange(len(boxes)))
+    return best[np.argsort(-boxes.score[best], kind="stable")][:MOST_DOUBTFUL]
 
 
 def _apart(measured: Sequence[Detection]) -> tuple[tuple[Detection, ...], list[Rejection]]:

@@ -84,9 +84,7 @@ def starts(of: Primitive, kind: Kind) -> list[FloatArray]:
     """Where the fit of a kind begins, for something that was first taken for ``of``: same place, same spread."""
     x, y, theta, *sizes = parameters(of).tolist()
     spread = [size / math.sqrt(factor) for size, factor in zip(sizes, MOMENTS[of.kind], strict=True)]
-    if of.kind is kind is not Kind.TRIANGLE:
-        turns = [0.0] if kind is Kind.CIRCLE else [0.0, math.pi / 4]
-    elif kind is Kind.TRIANGLE:
+    if kind is Kind.TRIANGLE:
         turns = [0.0, math.pi / 2, math.pi, -math.pi / 2]
         if of.kind is kind:
             turns += [2 * math.pi / 3, -2 * math.pi / 3]

@@ -16,6 +16,9 @@ from detect.raycost import MEASURED, RANGE, STOP, not_below, trace
 from prim.raycast import FloatArray
 from prim.shapes import Primitive
 
+LEAST_START = 0.005
+"""The first guess at the noise (m) is no smaller."""
+
 LEAST_NOISE = 0.002
 """Noise (m) below this is not told apart: poses and ranges as logs hold them are no better."""
 
@@ -40,7 +43,7 @@ def first_noise(candidates: Sequence[Candidate]) -> float:
     residuals = np.concatenate([_residuals(one.beams, one.start) for one in candidates])
     if len(residuals) < 10:
         return START_NOISE
-    return max(1.4826 * float(np.median(np.abs(residuals))), LEAST_NOISE, 0.005)
+    return max(1.4826 * float(np.median(np.abs(residuals))), LEAST_START)
 
 
 def _residuals(beams: Beams, primitive: Primitive) -> FloatArray:
@@ -65,7 +68,8 @@ def measured_footprint(candidates: Sequence[Candidate], sensor: Sensor) -> float
         beams, fit = one.seen_before(candidates, sensor), one.fits[0]
         beams = beams.of(beams.passing(one.now, FOOTPRINTS[-1]) & ~beams.passing(one.now, -FOOTPRINTS[-1]))
         for k, footprint in enumerate(FOOTPRINTS):
-            totals[k] += exact_costs(fit.kind, fit.p[None], beams, replace(sensor, footprint=footprint))[0]
+            cost = exact_costs(fit.kind, fit.p[None], beams, replace(sensor, footprint=footprint))[0]
+            totals[k] += cost if np.isfinite(cost) else 0.0  # larger than any primitive: it tells nothing
     return float(FOOTPRINTS[best]) if (best := int(np.argmin(totals))) > 1 else 0.0
 
 

@@ -44,7 +44,7 @@ TABLE_SPACING = 64
 """The tables hold so many entries per standard deviation, up to TABLE_REACH of them at both sides."""
 
 SMALLEST, LARGEST = 0.02, 1.2
-"""Full sizes (m) stay between these."""
+"""Width and height (m; of a disc the semi-axes) stay between these while a fit descends."""
 
 EDGE_X = (0.0, 2.0 / math.sqrt(5.0), -2.0 / math.sqrt(5.0))
 EDGE_Y = (-1.0, 1.0 / math.sqrt(5.0), 1.0 / math.sqrt(5.0))
@@ -52,6 +52,8 @@ EDGE_AT = (1.0 / 3.0, 2.0 / (3.0 * math.sqrt(5.0)), 2.0 / (3.0 * math.sqrt(5.0))
 """The unit triangle's edges: outward normals, and their distances from the centroid."""
 
 FAR, BEHIND = 1e30, 1e31
+ENDLESS = 1e20
+"""Stands for the inverse of nothing: a ray along a side never meets it."""
 
 
 @lru_cache(maxsize=1)
@@ -108,7 +110,8 @@ def entry(family: int, lx: float, ly: float, ux: float, uy: float) -> tuple[floa
         return t, lx + t * ux, ly + t * uy
     leave = FAR
     if family == BOX:
-        along, across = 1.0 / ux, 1.0 / uy
+        along = 1.0 / ux if ux != 0.0 else ENDLESS
+        across = 1.0 / uy if uy != 0.0 else ENDLESS
         near_x, far_x = -0.5 * abs(along) - lx * along, 0.5 * abs(along) - lx * along
         near_y, far_y = -0.5 * abs(across) - ly * across, 0.5 * abs(across) - ly * across
         leave = min(far_x, far_y)
@@ -120,12 +123,13 @@ def entry(family: int, lx: float, ly: float, ux: float, uy: float) -> tuple[floa
         for edge in range(3):
             ex, ey = EDGE_X[edge], EDGE_Y[edge]
             towards = ex * ux + ey * uy
-            crossing = (EDGE_AT[edge] - ex * lx - ey * ly) / towards
+            gap = EDGE_AT[edge] - ex * lx - ey * ly
+            crossing = gap / towards if towards != 0.0 else (ENDLESS if gap >= 0 else -ENDLESS)
             if towards < 0:
                 if crossing > t:
                     t, nx, ny = crossing, ex, ey
-            elif crossing < leave:
-                leave = crossing
+            else:
+                leave = min(leave, crossing)
     if t > leave:
         return FAR, 0.0, 0.0
     if leave < 0:

@@ -45,8 +45,8 @@ from prim.frames import Pose2D, Scan
 from prim.raycast import FloatArray
 from prim.shapes import Kind, Primitive
 
-MOST_DOUBTFUL = 24
-"""Of what the networks were unsure of, no more than this is asked the rays about: the best."""
+PREFERRED = 1.5
+"""What the networks found stays where it explains the rays at least 1 / this as well as what they did not find."""
 
 REACH, REACH_FITTED = 0.07, 0.03
 """Rays that come within this (m) of a candidate are looked at: at first, and once it is fitted."""
@@ -126,14 +126,14 @@ def refine_detections(
     rays support, likeliest first, what they do not with the reasons, and the noise: None where no ray passes any.
     """
     cells = MapCells.of(grid)
-    unsure = [] if before else [one for one, _ in detections.doubtful if not cells.hide(one.primitive)]
-    unsure = sorted(unsure, key=lambda one: -one.score)[:MOST_DOUBTFUL]
+    unsure = _gone(before, detections) if before else [one for one, _ in detections.doubtful]
+    unsure = [one for one in unsure if not cells.hide(one.primitive)]
     guesses = [one.primitive for one in (*detections.found, *unsure)]
     added = [_proposed(one) for one in proposals(cells, guesses)] if before is None else []
     wanted = (*detections.found, *unsure, *added)
     known = _known_before(wanted, before)
     starts = [known.get(number, one).primitive for number, one in enumerate(wanted)]
-    refined, found_std = refine(starts, scans, cells, noise_std, threads, known)
+    refined, found_std = refine(starts, scans, cells, noise_std, threads, known, len(detections.found))
     kept: list[Detection] = []
     rejected = []
     for number, (guess, made) in enumerate(zip(wanted, refined, strict=True)):
@@ -147,7 +147,13 @@ def refine_detections(
     rejected += [one for one in detections.rejected if id(one) not in judged]
     kept.sort(key=lambda one: -one.score)
     rejected.sort(key=lambda one: -one.score)
-    return Detections(tuple(kept), tuple(rejected)), found_std
+    return Detections(tuple(kept), tuple(rejected)), found_std if kept else None
+
+
+def _gone(before: Detections, detections: Detections) -> list[Detection]:
+    """What an earlier look had found, and the networks do not see now."""
+    now = [one.primitive for one in detections.found]
+    return [one for one in before.found if all(share_of(one.primitive, other) <= LEAST_SHARED for other in now)]
 
 
 def _known_before(wanted: Sequence[Detection], before: Detections | None) -> dict[int, Detection]:
@@ -213,12 +219,14 @@ def refine(
     noise_std: float | None = None,
     threads: int = 2,
     known: Mapping[int, Detection] | None = None,
+    preferred: int = 0,
 ) -> tuple[list[Refined | None], float | None]:
     """Fits primitives to the rays of the scans that a map was made of.
 
-    Those that are ``known``, by their index, are refined already: their kind is not asked for again. Returns, in the
-    order given, each one refined, or None for one that no ray passes or that another one stands for as well; and the
-    noise (m), found from the rays where it is not given.
+    Those that are ``known``, by their index, are refined already: their kind is not asked for again. Of two that
+    stand in one place, the one stays that explains the rays better, the first ``preferred`` ones before others.
+    Returns, in the order given, each one refined, or None for one that no ray passes, that another one stands for as
+    well, or that is too large or reaches into a wall; and the noise (m), found from the rays where it is not given.
     """
     if not primitives:
         return [], noise_std
@@ -235,7 +243,7 @@ def refine(
     with ThreadPoolExecutor(threads) as pool:
         look_behind(seen, cells, CLEARED_FIRST)
         fit_all(pool, seen, [True] * len(seen), sensor)
-        alone = _once(seen, sensor)
+        alone = _once(seen, candidates[:preferred], sensor)
         for one in alone:
             one.look_at(one.beams.passing(one.now, REACH_FITTED))
         alone = [one for one in alone if len(one.beams)]
@@ -256,9 +264,12 @@ def refine(
     return [made.get(id(one)) for one in candidates], sensor.std
 
 
-def _once(candidates: Sequence[Candidate], sensor: Sensor) -> list[Candidate]:
-    """The candidates without those that stand where a likelier one does."""
+def _once(candidates: Sequence[Candidate], preferred: Sequence[Candidate], sensor: Sensor) -> list[Candidate]:
+    """The candidates without those that stand where a likelier one does, or a preferred one not much less likely."""
     gains = {id(one): gain_of(one, candidates, sensor) for one in candidates}
+    for one in preferred:
+        if id(one) in gains:
+            gains[id(one)] *= PREFERRED
     stay: list[Candidate] = []
     for one in sorted(candidates, key=lambda one: -gains[id(one)]):
         if all(share_of(one.now, other.now) <= SAME for other in stay):
@@ -299,5 +310,5 @@ def _held_against_map(
     own = np.log(explained(met, distance[meets], np.ones(len(met), np.bool_), 0.0, sensor))
     free = np.log(explained(met, map_alone.stops[meets], map_alone.ends[meets], map_alone.spread, sensor))
     points = met.rays[:, :2] + distance[meets, None] * met.rays[:, 2:4] - (primitive.x, primitive.y)
-    sectors = np.floor(np.arctan2(points[:, 1], points[:, 0]) / (2 * math.pi) * SECTORS).astype(int)
+    sectors = np.floor(np.arctan2(points[:, 1], points[:, 0]) / (2 * math.pi) * SECTORS).astype(int) % SECTORS
     return float((free - own).mean()), len(met), len(np.unique(sectors)) / SECTORS

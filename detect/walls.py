@@ -41,10 +41,11 @@ THICKNESS = 0.002
 
 @dataclass(frozen=True)
 class Wall:
-    """A stretch of a wall behind a candidate, the line it lies on (its normal points to where it is seen from), and
-    the map's cells that stand for it there (their rows and columns).
+    """A stretch of a wall ``behind`` a candidate (where that was first taken to stand), the line it lies on (its
+    normal points to the candidate's side), and the map's cells that stand for it there (their rows and columns).
     """
 
+    behind: Primitive
     stretch: Primitive
     line: Line
     cells: tuple[NDArray[np.intp], NDArray[np.intp]]
@@ -58,10 +59,10 @@ class Wall:
         return bool((behind[np.abs(along) < self.stretch.size[0] / 2] > DEPTH).any())
 
 
-def walls_behind(cells: MapCells, candidates: Sequence[Primitive], eyes: Sequence[FloatArray]) -> list[Wall]:
+def walls_behind(cells: MapCells, candidates: Sequence[Primitive], starts: Sequence[Primitive]) -> list[Wall]:
     """The walls that candidates stand close to, and that come out straight on both sides of each.
 
-    ``eyes`` (2,): for each candidate the middle (m) of where it is seen from.
+    A wall is seen from the side on which a candidate was first taken to stand: ``starts``.
     """
     from scipy.spatial import cKDTree  # when it is needed: a replay without refinement starts faster
 
@@ -70,7 +71,7 @@ def walls_behind(cells: MapCells, candidates: Sequence[Primitive], eyes: Sequenc
         return []
     surface, places = cKDTree(points), cKDTree([(one.x, one.y) for one in candidates])
     made = []
-    for one, eye in zip(candidates, eyes, strict=True):
+    for one, start in zip(candidates, starts, strict=True):
         reach = circumradius(one) + AROUND
         near = points[surface.query_ball_point((one.x, one.y), reach)]
         if not is_within(one, near, CLOSE).any():
@@ -78,14 +79,14 @@ def walls_behind(cells: MapCells, candidates: Sequence[Primitive], eyes: Sequenc
         for other in places.query_ball_point((one.x, one.y), 2 * reach):
             near = near[~is_within(candidates[other], near, OWN)]
         for nx, ny, d in find_lines(near, cells.frame.resolution, 2 * LEAST_LENGTH, 2):
-            side = 1.0 if nx * eye[0] + ny * eye[1] > d else -1.0
-            wall = _stretch(cells, one, (side * nx, side * ny, side * d), near)
+            side = 1.0 if nx * start.x + ny * start.y > d else -1.0
+            wall = _stretch(cells, one, start, (side * nx, side * ny, side * d), near)
             if wall is not None:
                 made.append(wall)
     return made
 
 
-def _stretch(cells: MapCells, candidate: Primitive, line: Line, points: FloatArray) -> Wall | None:
+def _stretch(cells: MapCells, candidate: Primitive, start: Primitive, line: Line, points: FloatArray) -> Wall | None:
     """The stretch of a line behind a candidate; None where the candidate is not close to it."""
     nx, ny, d = line
     gap = float((candidate.outline(32) @ np.array([nx, ny]) - d).min())
@@ -105,4 +106,4 @@ def _stretch(cells: MapCells, candidate: Primitive, line: Line, points: FloatArr
     stretch = Primitive(
         Kind.RECTANGLE, nx * d - ny * at, ny * d + nx * at, theta, (high - low, THICKNESS)
     ).canonical()
-    return Wall(stretch, line, cells.large_within(stretch, WALL_CELLS * resolution))
+    return Wall(start, stretch, line, cells.large_within(stretch, WALL_CELLS * resolution))

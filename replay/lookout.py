@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from detect.tracks import Tracker
 
 SCANS_ON_THE_WAY = 60
-"""A look on the way is refined by about so many of the scans, evenly spread."""
+"""A look on the way is refined by so many of the scans to twice as many, evenly spread."""
 
 SHIPPED = Path(__file__).parents[1] / "detect" / "shipped"
 """The weights that come with prim: a folder for each mapper."""
@@ -73,6 +73,7 @@ class Lookout:
         self._noise_std = noise_std
         self._scans: list[tuple[Scan, Pose2D]] = []
         self._before: Detections | None = None
+        self._count, self._stride = 0, 1
         self._searched_at = 0
         self.refines = refines
 
@@ -84,9 +85,18 @@ class Lookout:
     def update(self, scan: Scan, pose: Pose2D) -> None:
         """Adds a scan to the detector's own map, for looks on the way."""
         if self.refines:
-            self._scans.append((scan, pose))
+            self._keep_some(scan, pose)
         if self._own is not None:
             self._own.update(scan, pose)
+
+    def _keep_some(self, scan: Scan, pose: Pose2D) -> None:
+        """Keeps scans for looks on the way, evenly spread: every other one goes where they become too many."""
+        if self._count % self._stride == 0:
+            self._scans.append((scan, pose))
+        self._count += 1
+        if len(self._scans) >= 2 * SCANS_ON_THE_WAY:
+            self._scans = self._scans[::2]
+            self._stride *= 2
 
     def map_so_far(self, mapper: Mapper) -> OccupancyGrid:
         """The map that the detector looks at on the way."""
@@ -112,12 +122,11 @@ class Lookout:
 
         if scans is not None:
             return refine_detections(detections, scans, grid, self._noise_std, cores())
-        some = self._scans[:: max(1, len(self._scans) // SCANS_ON_THE_WAY)]
-        anew = len(self._scans) >= 2 * self._searched_at
+        anew = self._count >= 2 * self._searched_at
         if anew:
-            self._searched_at = len(self._scans)
+            self._searched_at = self._count
         before = None if anew else self._before
-        refined, noise_std = refine_detections(detections, some, grid, self._noise_std, cores(), before)
+        refined, noise_std = refine_detections(detections, self._scans, grid, self._noise_std, cores(), before)
         self._before = refined
         return refined, noise_std
 

@@ -22,6 +22,9 @@ from replay.scans import counted
 
 SCHEMA = "prim-replay/1"
 
+LEAST_RAY_NOISE = 0.002
+"""Refinement tells no smaller noise (m)."""
+
 CELLS_LIMIT = 1.5
 """Noise below this many cells cannot be told from the cells' own size."""
 
@@ -201,7 +204,8 @@ def table(result: ReplayResult) -> list[tuple[str, str]]:
     if result.sighting is not None:
         rows.append(("primitives", _counted(result.sighting)))
         if result.sighting.noise_std is not None and result.options.noise_std is None:
-            rows.append(("ray noise", f"{result.sighting.noise_std * 1000:.1f} mm (found on the primitives)"))
+            least = "at most " if result.sighting.noise_std <= LEAST_RAY_NOISE else ""
+            rows.append(("ray noise", f"{least}{result.sighting.noise_std * 1000:.1f} mm (found on the primitives)"))
         if result.sighting.errors is not None:
             rows += _quality(result.sighting.errors)
     if result.blind is not None:

@@ -107,3 +107,17 @@ def test_walks_end_in_the_first_occupied_cell_or_leave() -> None:
     assert stops[2] == pytest.approx(0.3 * math.sqrt(2), abs=0.008)
     raycost.walk(occupied, 0, 0, 100.0, beams, np.full(3, 0.2), stops, ends)
     assert not ends.any() and (stops <= 0.2 + 1e-12).all()
+
+
+@pytest.mark.parametrize("kind", [Kind.SQUARE, Kind.RECTANGLE, Kind.TRIANGLE])
+@pytest.mark.parametrize("y", [-0.2, -0.04, 0.0, 0.04, 0.2])
+def test_rays_along_a_side(kind: Kind, y: float) -> None:
+    """As of a robot that stands just as a box does."""
+    primitive = shape(kind, 0.0, 0.0, 0.0)
+    for sign in (1.0, -1.0):
+        beams = np.zeros((2, 7))
+        beams[0, :4], beams[1, :4] = (-sign, y, sign, 0.0), (y, -sign, 0.0, sign)
+        distance = np.empty(2)
+        raycost.trace(FAMILY[kind], parameters(primitive), beams, distance)
+        exact = [primitive.cast(tuple(beam[:2]), beam[None, 2:4])[0] for beam in beams]
+        assert np.where(distance == raycost.FAR, np.inf, distance) == pytest.approx(exact, abs=1e-9)

@@ -171,6 +171,26 @@ def test_close_to_a_wall(kind: Kind) -> None:
     assert polygon_iou(refined[0].primitive, at_wall) > 0.9
 
 
+@pytest.mark.parametrize("beyond", [0, 1, 3])
+def test_beside_a_partition_that_is_seen_from_both_sides(beyond: int) -> None:
+    """However often the robot was on its other side."""
+    one = Primitive(Kind.SQUARE, 0.0, 0.18, 0.0, (0.2,))
+    walls = (*room().walls, (-1.0, 0.0, 1.0, 0.0))
+    taken = scans(World((2.0, 2.0), (one,), walls), 0.02)
+    some = [entry for entry in taken if entry[1].y > 0] + beyond * [entry for entry in taken if entry[1].y < 0]
+    refined, _ = refine([one], some, MapCells.of(mapped(some)))
+    assert refined[0] is not None and polygon_iou(refined[0].primitive, one) > 0.97
+
+
+def test_what_an_earlier_look_found_does_not_vanish(
+    exact: tuple[World, list[tuple[Scan, Pose2D]], OccupancyGrid],
+) -> None:
+    world, taken, grid = exact
+    before, _ = refine_detections(Detections((), ()), taken, grid)
+    after, _ = refine_detections(Detections((found(world.primitives[0]),), ()), taken, grid, before=before)
+    assert len(before.found) == len(after.found) == len(world.primitives)
+
+
 def test_in_the_shadow_of_another(exact: tuple[World, list[tuple[Scan, Pose2D]], OccupancyGrid]) -> None:
     """Two that stand 40 mm apart are told apart, each explained beside the other."""
     pair = [Primitive(Kind.CIRCLE, 0.0, 0.0, None, (0.1,)), Primitive(Kind.SQUARE, 0.24, 0.0, 0.0, (0.2,))]
