@@ -237,7 +237,8 @@ def _plot(results: Sequence[Result], path: Path) -> None:
             axis.set(xlabel="noise n tested", ylabel=f"{BOXES[name]}, all shapes", ylim=(0, 1))
             axis.set_title(f"trained n = 0.05, noise {reading}", fontsize=10)
             axis.grid(alpha=0.3)
-            axis.legend(fontsize=7)
+            if axis.get_legend_handles_labels()[0]:
+                axis.legend(fontsize=7)
     figure.savefig(path, dpi=110)
 
 

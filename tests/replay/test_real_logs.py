@@ -68,7 +68,7 @@ def test_without_the_offset_the_mount_is_asked_for(real_log: Find) -> None:
 @every
 def test_the_csail_floor_plan(real_log: Find, mapper: str) -> None:
     """The known size of the floor; corridors free, straight walls; no poses lost."""
-    result = Pipeline(real_log("csail.mcap"), ReplayOptions(mapper=mapper, resolution=0.05)).run()
+    result = Pipeline(real_log("csail.mcap"), ReplayOptions(mapper=mapper, resolution=0.05, detect=False)).run()
     assert (result.poses.source, result.poses.origin) == ("tf", "odom > laser")
     assert result.scans_used == 686
     x0, y0, x1, y1 = result.grid.frame.bounds
@@ -82,7 +82,7 @@ def test_the_csail_floor_plan(real_log: Find, mapper: str) -> None:
 
 def test_csail_s_odometry_and_transforms_agree(real_log: Find) -> None:
     tf, odom = (
-        Pipeline(real_log("csail.mcap"), ReplayOptions(resolution=0.5, pose=pose)).run().poses.poses
+        Pipeline(real_log("csail.mcap"), ReplayOptions(resolution=0.5, pose=pose, detect=False)).run().poses.poses
         for pose in ("tf", "odom")
     )
     assert odom == pytest.approx(tf, abs=1e-6)
@@ -90,7 +90,7 @@ def test_csail_s_odometry_and_transforms_agree(real_log: Find) -> None:
 
 def test_forward_tells_glass_from_walls(real_log: Find) -> None:
     """The hall in the middle of the floor is seen through its railing: free, but for the railing itself."""
-    result = Pipeline(real_log("csail.mcap"), ReplayOptions(mapper="forward", resolution=0.05)).run()
+    result = Pipeline(real_log("csail.mcap"), ReplayOptions(mapper="forward", resolution=0.05, detect=False)).run()
     assert result.noise_std == pytest.approx(0.032, abs=0.01)
     x0, y0, _, _ = result.grid.frame.bounds
     row, col = round((-5.6 - y0) / 0.05), round((11.7 - x0) / 0.05)
