@@ -37,6 +37,7 @@ VECTOR_TYPE = "geometry_msgs/msg/Vector3Stamped"
 TF_TYPE = "tf2_msgs/msg/TFMessage"
 POSE_TYPE = "geometry_msgs/msg/PoseStamped"
 POSE_WITH_COVARIANCE_TYPE = "geometry_msgs/msg/PoseWithCovarianceStamped"
+FIX_TYPE = "sensor_msgs/msg/NavSatFix"
 MARKERS_TYPE = "visualization_msgs/msg/MarkerArray"
 
 MAP_FRAME = "map"
@@ -207,6 +208,35 @@ def decode_primitives(data: bytes) -> tuple[int, tuple[Primitive, ...]]:
             primitive = Primitive.from_json({**truth, "x": seen.x, "y": seen.y, "theta": seen.theta})
             primitives.append(primitive.canonical())
     return stamp, tuple(primitives)
+
+
+class StampedVector(NamedTuple):
+    """Three numbers as ROS messages hold them: stamp (ns), frame, x, y, z or latitude, longitude (deg), altitude."""
+
+    stamp: int
+    frame_id: str
+    x: float
+    y: float
+    z: float
+
+
+def decode_vector(data: bytes) -> StampedVector:
+    """A geometry_msgs/PointStamped or Vector3Stamped. Raises ValueError."""
+    cdr = CdrReader(data)
+    return StampedVector(*cdr.header(), *cdr.unpack("3d", 8))
+
+
+def decode_fix(data: bytes) -> StampedVector:
+    """The latitude, longitude (degrees) and altitude (m) of a sensor_msgs/NavSatFix; NaN where it has no fix.
+
+    Raises ValueError.
+    """
+    cdr = CdrReader(data)
+    header = cdr.header()
+    status = cdr.unpack("b", 1)[0]
+    cdr.unpack("H", 2)
+    place = cdr.unpack("3d", 8)
+    return StampedVector(*header, *(place if status >= 0 else (math.nan,) * 3))
 
 
 def decode_poses(type_name: str, data: bytes) -> list[StampedPose]:

@@ -180,6 +180,13 @@ def pose_rmse(estimate: FloatArray, truth: FloatArray) -> tuple[float, float]:
     return float(np.sqrt((delta[:, :2] ** 2).sum(axis=1).mean())), float(np.sqrt((turn**2).mean()))
 
 
+def pose_nees(estimate: FloatArray, truth: FloatArray, covariances: FloatArray) -> float:
+    """The mean normalised error squared of poses (N, 3) with covariances (N, 3, 3): 3 where those are right."""
+    delta = estimate - truth
+    delta[:, 2] = (delta[:, 2] + np.pi) % (2 * np.pi) - np.pi
+    return float(np.einsum("ni,ni->n", delta, np.linalg.solve(covariances, delta[..., None])[..., 0]).mean())
+
+
 def _pair(i: int, j: int, detection: Primitive, truth: Primitive) -> Pair:
     width, height = detection.width_height
     true_width, true_height = truth.width_height

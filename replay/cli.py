@@ -21,6 +21,7 @@ from prim.errors import PrimError, UsageError
 
 if TYPE_CHECKING:
     from prim.world import Bounds
+    from replay.localize import FuseOptions
     from replay.pipeline import ReplayOptions, ReplayResult
     from replay.show import Viewer, ViewerOptions
 
@@ -52,6 +53,7 @@ class PoseName(StrEnum):
     TRUTH = "truth"
     TF = "tf"
     ODOM = "odom"
+    FUSED = "fused"
 
 
 def _show_version(wanted: bool) -> None:
@@ -69,6 +71,23 @@ def replay(
     bounds: Annotated[str, typer.Option(metavar="auto or X0 Y0 X1 Y1", help="The map's bounds, metres.")] = "auto",
     scan_topic: Annotated[str | None, typer.Option(metavar="T", help="The topic of scans.")] = None,
     odom_topic: Annotated[str | None, typer.Option(metavar="T", help="The topic of poses.")] = None,
+    fuse: Annotated[
+        str | None,
+        typer.Option(metavar="odom,gps,compass", help="What poses are fused from. [default: all that is there]"),
+    ] = None,
+    gps_topic: Annotated[str | None, typer.Option(metavar="T", help="The topic of position fixes.")] = None,
+    compass_topic: Annotated[str | None, typer.Option(metavar="T", help="The topic of north vectors.")] = None,
+    pose_noise: Annotated[
+        tuple[float, float] | None,
+        typer.Option(metavar="M DEG", help="Noise (std) of GPS and compass. [default: found from the log]"),
+    ] = None,
+    odom_noise: Annotated[
+        tuple[float, float] | None,
+        typer.Option(metavar="M DEG", help="Odometry's std after a metre of way. [default: found from the log]"),
+    ] = None,
+    no_deskew: Annotated[
+        bool, typer.Option("--no-deskew", help="Take all beams of a scan as measured at its stamp.")
+    ] = False,
     start: Annotated[float | None, typer.Option(metavar="S", help="Begin S seconds into the log.")] = None,
     end: Annotated[float | None, typer.Option(metavar="S", help="End S seconds into the log.")] = None,
     duration: Annotated[float | None, typer.Option(metavar="S", help="Replay S seconds.")] = None,
@@ -165,6 +184,8 @@ def replay(
         laser_offset=offset,
         max_range=max_range,
         standing_still=standing_still,
+        fuse=_fuse_options(fuse, gps_topic, compass_topic, pose_noise, odom_noise),
+        deskew=not no_deskew,
         selection=Selection(start, end, duration, n_scans, stride),
         rate=rate,
         map_every=map_every,
@@ -293,6 +314,37 @@ def _keep_serving() -> None:
     with suppress(KeyboardInterrupt):
         while True:
             time.sleep(3600)
+
+
+def _fuse_options(
+    sensors: str | None,
+    gps_topic: str | None,
+    compass_topic: str | None,
+    pose_noise: tuple[float, float] | None,
+    odom_noise: tuple[float, float] | None,
+) -> FuseOptions:
+    """What poses are fused from, and how noisy that is. Raises UsageError."""
+    from replay.fusion import PoseNoise
+    from replay.localize import SENSORS, FuseOptions
+
+    names = SENSORS if sensors is None else tuple(name.strip() for name in sensors.split(","))
+    unknown = [name for name in names if name not in SENSORS]
+    if unknown:
+        raise UsageError(
+            f"--fuse {sensors}: {unknown[0] or 'an empty name'} is no sensor; they are {', '.join(SENSORS)}"
+        )
+    for option, given in (("--pose-noise", pose_noise), ("--odom-noise", odom_noise)):
+        if given is not None and not all(0 < value < math.inf for value in given):
+            raise UsageError(f"{option} is {given[0]:g} {given[1]:g}: both must be above 0")
+    fixes, turns = pose_noise or (None, None)
+    metres, degrees = odom_noise or (None, None)
+    noise = PoseNoise(
+        fixes,
+        None if turns is None else math.radians(turns),
+        metres,
+        None if degrees is None else math.radians(degrees),
+    )
+    return FuseOptions(tuple(name for name in SENSORS if name in names), gps_topic, compass_topic, noise)
 
 
 def join_bounds(arguments: Sequence[str]) -> list[str]:

@@ -2,44 +2,42 @@
 
 from __future__ import annotations
 
-from collections import Counter, defaultdict
-from collections.abc import Sequence
-from dataclasses import dataclass, field
-from functools import cached_property, partial
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
 from prim.errors import LogReadError
-from prim.frames import Pose2D, Stamps, Trajectory
+from prim.frames import Pose2D, Stamps
 from prim.log import LogReader, Topic
 from prim.messages import (
     BASE_FRAME,
     MAP_FRAME,
-    ODOM_FRAME,
     ODOMETRY_TYPE,
     POSE_DECODERS,
     POSE_TYPE,
     POSE_WITH_COVARIANCE_TYPE,
-    TF_TYPE,
     TRUE_POSE_TOPIC,
-    StampedPose,
-    decode_poses,
-    planar,
 )
 from prim.raycast import FloatArray
+from replay.fusion import Estimate, Fusion, Nodes, PoseNoise, nodes_at
+from replay.sensors import Sensed, find_compass, find_gps, headings, read_odometry, read_sensors
+from replay.transforms import ROOTS, TransformTree, flatten
 
-SOURCES = ("auto", "truth", "tf", "odom")
+FUSED = "fused"
+SOURCES = ("auto", "truth", "tf", "odom", FUSED)
 STILL = "still"
+ODOM, GPS, COMPASS = SENSORS = ("odom", "gps", "compass")
+"""What poses are fused from."""
 
-ROOTS = (MAP_FRAME, ODOM_FRAME)
-"""Frames that stand still, the best first."""
 
 MAX_GAP = 1.0
 """Poses further apart (s) than this are interpolated over a gap, which is said."""
 
-MAX_TILT = 0.97
-"""Below this cosine a laser's plane counts as tilted, and its scans as no horizontal section (14 degrees)."""
+MANY_REJECTED = 0.02
+"""Where a larger share of a sensor's readings is not used, it is said."""
 
 
 @dataclass(frozen=True)
@@ -47,8 +45,11 @@ class LaserPoses:
     """The laser's pose at each of N scans.
 
     ``poses`` (N, 3) are x, y (m), theta (rad) in the map frame; ``valid`` (N,) marks the scans within the time
-    of the poses. ``upside_down`` lasers turn the other way. ``source`` is one of SOURCES or STILL, ``origin``
-    says it in full, ``notes`` what was assumed.
+    of the poses; ``ends`` (N, 3) are the poses at each scan's last beam, where that is not taken with the first.
+    ``upside_down`` lasers turn the other way. ``source`` is one of SOURCES or STILL, ``origin``
+    says it in full, ``notes`` what was assumed. Fused poses have ``covariances`` (N, 3, 3), a ``frame_covariance``
+    (3, 3) of the map's own place (see :meth:`replay.fusion.Estimate.frame_covariance`), and ``sensors`` that say how
+    noisy each was found to be.
     """
 
     source: str
@@ -57,95 +58,78 @@ class LaserPoses:
     valid: NDArray[np.bool_]
     upside_down: bool = False
     notes: tuple[str, ...] = ()
+    ends: FloatArray | None = None
+    covariances: FloatArray | None = None
+    frame_covariance: FloatArray | None = None
+    sensors: tuple[Sensor, ...] = ()
+
+    def at(self, position: int) -> Pose2D:
+        """A scan's pose, with its covariance where that is known."""
+        covariance = None if self.covariances is None else self.covariances[position]
+        x, y, theta = self.poses[position].tolist()
+        return Pose2D(x, y, theta, covariance)
+
+    def end(self, position: int) -> Pose2D | None:
+        """The pose at a scan's last beam; None where that is taken with the first."""
+        return None if self.ends is None else Pose2D(*self.ends[position].tolist())
+
+
+@dataclass(frozen=True)
+class Sensor:
+    """A sensor that poses were fused from: how many readings were used, and how many were too far off to be.
+
+    ``std`` is its noise by name, in SI units: ``m`` and ``rad``; the odometry's after one metre of way. ``bias``
+    (rad) is what a compass is off by all the time.
+    """
+
+    name: str
+    topic: str
+    used: int
+    rejected: int
+    std: Mapping[str, float]
+    bias: float = 0.0
+
+
+@dataclass(frozen=True)
+class FuseOptions:
+    """What ``fused`` poses are made of: which of SENSORS, on which topics, and what is known of their noise."""
+
+    sensors: tuple[str, ...] = SENSORS
+    gps_topic: str | None = None
+    compass_topic: str | None = None
+    noise: PoseNoise = field(default_factory=PoseNoise)
 
 
 @dataclass(frozen=True)
 class ScanTimes:
-    """The scans to find poses for: their stamps (N,) in ns and the frame they are given in."""
+    """The scans to find poses for: their stamps (N,) in ns, the frame they are given in, and the time (ns) that the
+    laser takes from the first beam to the last.
+    """
 
     stamps: Stamps
     frame_id: str
+    sweep: int = 0
 
-
-@dataclass(frozen=True)
-class Transforms:
-    """3D transforms over time: ``stamps`` (N,), ``translations`` (N, 3), ``rotations`` (N, 4) as x, y, z, w."""
-
-    stamps: Stamps
-    translations: FloatArray
-    rotations: FloatArray
-    static: bool
-
-    def at(self, stamps: Stamps) -> tuple[FloatArray, FloatArray, NDArray[np.bool_]]:
-        """Rotation matrices (M, 3, 3), translations (M, 3), and which stamps lie within the transforms' time.
-
-        In between, translations are interpolated linearly and rotations along the shortest arc.
-        """
-        after = np.clip(np.searchsorted(self.stamps, stamps), 0, len(self.stamps) - 1)
-        before = np.maximum(after - 1, 0)
-        span = np.maximum(self.stamps[after] - self.stamps[before], 1)
-        share = np.clip((stamps - self.stamps[before]) / span, 0.0, 1.0)[:, None]
-        translations = (1 - share) * self.translations[before] + share * self.translations[after]
-        rotations = _slerp(self.rotations[before], self.rotations[after], share)
-        within = (stamps >= self.stamps[0]) & (stamps <= self.stamps[-1]) | self.static
-        return _matrices(rotations), translations, within
-
-
-@dataclass
-class TransformTree:
-    """The tf tree of a log: each frame's parent and where the frame stands in it over time."""
-
-    edges: dict[str, tuple[str, Transforms]] = field(default_factory=dict)
-    disputed: list[tuple[str, str]] = field(default_factory=list)
-
-    @classmethod
-    def read(cls, log: LogReader) -> TransformTree:
-        """Reads all topics of tf messages. Raises LogReadError."""
-        found: dict[tuple[str, str], list[StampedPose]] = defaultdict(list)
-        static: set[tuple[str, str]] = set()
-        for topic in log.of_type(TF_TYPE):
-            for _, poses in log.decoded(topic, partial(decode_poses, TF_TYPE)):
-                for pose in poses:
-                    edge = pose.frame_id.lstrip("/"), pose.child_frame_id.lstrip("/")
-                    found[edge].append(pose)
-                    if topic.name.endswith("tf_static"):
-                        static.add(edge)
-        tree = cls()
-        usable = {edge: kept for edge, poses in found.items() if (kept := [p for p in poses if _usable(p)])}
-        parents = Counter(child for _, child in usable)
-        # of several parents the last one stays: map or odom, else the one with the most transforms
-        for edge, poses in sorted(usable.items(), key=lambda item: (item[0][0] in ROOTS, len(item[1]))):
-            tree.edges[edge[1]] = edge[0], _transforms(poses, edge in static or len(poses) == 1)
-        tree.disputed = [(child, tree.edges[child][0]) for child, count in parents.items() if count > 1]
-        return tree
-
-    def chain(self, frame: str) -> list[str]:
-        """The frames from ``frame`` up to its root, both included."""
-        chain = [frame.lstrip("/")]
-        while chain[-1] in self.edges and self.edges[chain[-1]][0] not in chain:
-            chain.append(self.edges[chain[-1]][0])
-        return chain
-
-    def lookup(self, chain: Sequence[str], stamps: Stamps) -> tuple[FloatArray, FloatArray, NDArray[np.bool_]]:
-        """Rotations, translations and validity of the chain's first frame in its last, at ``stamps``."""
-        rotation = np.broadcast_to(np.eye(3), (len(stamps), 3, 3))
-        translation = np.zeros((len(stamps), 3))
-        valid = np.ones(len(stamps), dtype=bool)
-        for frame in chain[:-1]:
-            turn, shift, within = self.edges[frame][1].at(stamps)
-            rotation = turn @ rotation
-            translation = np.einsum("nij,nj->ni", turn, translation) + shift
-            valid &= within
-        return rotation, translation, valid
+    @property
+    def wanted(self) -> Stamps:
+        """When poses are wanted: at every scan's first beam and, where a sweep takes time, at every last one."""
+        return np.concatenate((self.stamps, self.stamps + self.sweep)) if self.sweep else self.stamps
 
 
 class Localizer:
     """Finds the laser's poses in a log by the source asked for. Raises LogReadError, naming what is there."""
 
-    def __init__(self, log: LogReader, odom_topic: str | None = None, laser_offset: Pose2D | None = None) -> None:
+    def __init__(
+        self,
+        log: LogReader,
+        odom_topic: str | None = None,
+        laser_offset: Pose2D | None = None,
+        fuse: FuseOptions | None = None,
+    ) -> None:
         self._log = log
         self._odom_topic = odom_topic
         self._offset = laser_offset
+        self._fuse = fuse or FuseOptions()
         self._tree_notes: tuple[str, ...] = ()
 
     @cached_property
@@ -160,9 +144,10 @@ class Localizer:
     def locate(self, scans: ScanTimes, source: str = "auto") -> LaserPoses:
         """The laser's pose at every scan, from ``source`` or, with ``auto``, from the best there is.
 
-        That is the ground truth, else a tf chain to ``map``, else any tf chain, else odometry.
+        That is the ground truth, else a tf chain to ``map``, else what can be fused with a GPS or a compass, else any
+        tf chain, else odometry.
         """
-        found = self._find(scans, source)
+        found = _with_ends(self._find(scans, source), len(scans.stamps))
         if not found.valid.any():
             raise LogReadError(self._log.path, *self._no_overlap(scans, found))
         return found
@@ -174,7 +159,11 @@ class Localizer:
             return self._from_truth(scans)
         if source == "odom":
             return self._from_odometry(scans, source)
+        if source == FUSED:
+            return self._from_fusion(scans)
         chain = self._fixed_chain(scans.frame_id)
+        if source == "auto" and chain[-1] != MAP_FRAME and self._can_fuse():
+            return self._from_fusion(scans)
         if source == "tf" or len(chain) > 1:
             return self._from_tf(scans, chain)
         return self._from_odometry(scans, source)
@@ -227,42 +216,99 @@ class Localizer:
 
     def _from_topic(self, scans: ScanTimes, topic: Topic, source: str) -> LaserPoses:
         """The robot's poses on a topic, and the laser where it is mounted on the robot."""
-        stamps: list[int] = []
-        poses: list[tuple[float, float, float]] = []
-        base = ""
-        unusable = 0
-        for _, messages in self._log.decoded(topic, partial(decode_poses, topic.type)):
-            for message in messages:
-                if _usable(message):
-                    pose = planar(message)
-                    stamps.append(message.stamp)
-                    poses.append((pose.x, pose.y, pose.theta))
-                    base = message.child_frame_id.lstrip("/")
-                else:
-                    unusable += 1
-        if not stamps:
-            raise LogReadError(self._log.path, f"{topic.name} has no usable pose", "give another --pose")
-        trajectory = Trajectory.from_unsorted(stamps, poses)
-        at, valid = trajectory.at(scans.stamps)
-        mounts, upside_down, notes = self._mount(scans, base or BASE_FRAME)
-        notes += _gap_note(topic.name, trajectory.stamps, scans.stamps)
-        if unusable:
-            notes += (f"{topic.name}: {unusable} poses that are not finite or have no rotation were skipped",)
+        odometry = read_odometry(self._log, topic)
+        at, valid = odometry.trajectory.at(scans.wanted)
+        mounts, upside_down, notes = self._mount(scans, odometry.base or BASE_FRAME)
+        notes += _gap_note(topic.name, odometry.trajectory.stamps, scans.stamps) + odometry.notes
         return LaserPoses(source, topic.name, _compose(at, mounts), valid, upside_down, notes)
+
+    def _can_fuse(self) -> bool:
+        """Whether the log has a GPS or compass to fuse with, as far as ``auto`` is concerned."""
+        try:
+            odometry, gps, compass = self._sensor_topics()
+        except LogReadError:
+            return False
+        return bool((odometry and (gps or compass)) or (gps and compass))
+
+    def _sensor_topics(self) -> tuple[Topic | None, Topic | None, Topic | None]:
+        """The topics of odometry, GPS and compass; None for those that are not there or not wanted."""
+        fuse = self._fuse
+        return (
+            self._odometry_topic() if ODOM in fuse.sensors else None,
+            find_gps(self._log, fuse.gps_topic) if GPS in fuse.sensors else None,
+            find_compass(self._log, fuse.compass_topic) if COMPASS in fuse.sensors else None,
+        )
+
+    def _from_fusion(self, scans: ScanTimes) -> LaserPoses:
+        """The laser's poses by odometry, GPS and compass together, smoothed."""
+        sensed = read_sensors(self._log, *self._sensor_topics())
+        if sensed.odometry is None and (sensed.gps is None or sensed.compass is None):
+            raise LogReadError(
+                self._log.path,
+                f"fused poses need odometry, or a GPS and a compass: there is {sensed.topics or 'none of them'}",
+                "give another --pose, or the topics by --odom-topic, --gps-topic and --compass-topic",
+            )
+        base = (sensed.odometry.base if sensed.odometry else "") or BASE_FRAME
+        nodes = self._nodes(scans, base, sensed)
+        fusion = Fusion(nodes, self._fuse.noise)
+        estimate = fusion.smoothed()
+        wanted = scans.wanted
+        valid = (wanted >= nodes.stamps[0]) & (wanted <= nodes.stamps[-1])
+        at = np.searchsorted(nodes.stamps, np.clip(wanted, nodes.stamps[0], nodes.stamps[-1]))
+        mounts, upside_down, notes = self._mount(scans, base)
+        if sensed.odometry:
+            notes += _gap_note(sensed.odometry.topic, sensed.odometry.trajectory.stamps, scans.stamps)
+        sensors = tuple(_sensors(sensed, estimate))
+        return LaserPoses(
+            FUSED,
+            sensed.topics,
+            _compose(estimate.poses[at], mounts),
+            valid,
+            upside_down,
+            notes + sensed.notes + _fusion_notes(sensors),
+            covariances=_carried(estimate.covariances[at], estimate.poses[at], mounts),
+            frame_covariance=estimate.frame_covariance(scans.stamps),
+            sensors=sensors,
+        )
+
+    def _nodes(self, scans: ScanTimes, base: str, sensed: Sensed) -> Nodes:
+        """What is known of the base's motion, at the scans' stamps and at those of the readings."""
+        gps, compass = sensed.gps, sensed.compass
+        lever = self._fixed_mount(gps.frame_id, base) if gps else Pose2D()
+        try:
+            return nodes_at(
+                scans.wanted,
+                sensed.odometry.trajectory if sensed.odometry else None,
+                (gps.stamps, gps.values) if gps else None,
+                (compass.stamps, headings(compass, self._fixed_mount(compass.frame_id, base))) if compass else None,
+                (lever.x, lever.y),
+            )
+        except ValueError:
+            what = f"no scan lies within the time of {sensed.topics}"
+            raise LogReadError(self._log.path, what, "two clocks in one log? give another --pose") from None
+
+    def _fixed_mount(self, frame: str, base: str) -> Pose2D:
+        """Where a sensor's frame stands on the robot by static transforms; the base itself where there are none."""
+        chain = self._tree.chain(frame)
+        if base not in chain[1:]:
+            return Pose2D()
+        chain = chain[: chain.index(base) + 1]
+        rotation, translation, _ = self._tree.lookup(chain, np.zeros(1, dtype=np.int64))
+        return Pose2D(*flatten(rotation, translation)[0][0].tolist())
 
     def stand_still(self, scans: ScanTimes) -> LaserPoses:
         """A robot at the map's origin all the time, its laser where the offset or tf puts it."""
         mounts, upside_down, _ = self._mount(scans, BASE_FRAME)
-        valid = np.ones(len(scans.stamps), dtype=bool)
-        return LaserPoses(STILL, "standing still", mounts, valid, upside_down)
+        valid = np.ones(len(mounts), dtype=bool)
+        return _with_ends(LaserPoses(STILL, "standing still", mounts, valid, upside_down), len(scans.stamps))
 
     def _mount(self, scans: ScanTimes, base: str) -> tuple[FloatArray, bool, tuple[str, ...]]:
         """Where the laser stands on the robot at every scan, whether upside down, and what had to be assumed."""
         frame = scans.frame_id.lstrip("/")
         chain = self._tree.chain(frame)
         chain = chain[: chain.index(base) + 1] if base in chain else chain[:1]
-        rotation, translation, _ = self._tree.lookup(chain, scans.stamps)
-        mounts, upside_down, notes = _flatten(rotation, translation)
+        rotation, translation, _ = self._tree.lookup(chain, scans.wanted)
+        mounts, upside_down, notes = flatten(rotation, translation)
         notes += self._tree_notes
         if self._offset is not None:
             mounts[:] = self._offset.x, self._offset.y, self._offset.theta
@@ -293,8 +339,8 @@ class Localizer:
                 f"tf has no chain from {scans.frame_id!r} to a fixed frame (its frames: {frames or 'none'})",
                 "give another --pose",
             )
-        rotation, translation, valid = self._tree.lookup(chain, scans.stamps)
-        poses, upside_down, notes = _flatten(rotation, translation)
+        rotation, translation, valid = self._tree.lookup(chain, scans.wanted)
+        poses, upside_down, notes = flatten(rotation, translation)
         for frame in chain[:-1]:
             parent, edge = self._tree.edges[frame]
             if not edge.static:
@@ -326,6 +372,16 @@ def _gap_note(what: str, poses: Stamps, scans: Stamps) -> tuple[str, ...]:
     return (f"{what}: {scans_lie} in a gap of up to {gaps.max():.1f} s between poses, and are placed in between",)
 
 
+def _with_ends(found: LaserPoses, scans: int) -> LaserPoses:
+    """Poses found at first and last beams, told apart; where a last one's is not known it is the first one's."""
+    if len(found.poses) == scans:
+        return found
+    valid, known = found.valid[:scans], found.valid[scans:, None]
+    poses, ends = found.poses[:scans], found.poses[scans:]
+    covariances = None if found.covariances is None else found.covariances[:scans]
+    return replace(found, poses=poses, valid=valid, ends=np.where(known, ends, poses), covariances=covariances)
+
+
 def _compose(poses: FloatArray, mounts: FloatArray) -> FloatArray:
     """Poses (N, 3) of frames that are mounted at ``mounts`` (N, 3) on frames at ``poses`` (N, 3)."""
     cos, sin = np.cos(poses[:, 2]), np.sin(poses[:, 2])
@@ -334,54 +390,41 @@ def _compose(poses: FloatArray, mounts: FloatArray) -> FloatArray:
     return np.column_stack((x, y, poses[:, 2] + mounts[:, 2]))
 
 
-def _flatten(rotation: FloatArray, translation: FloatArray) -> tuple[FloatArray, bool, tuple[str, ...]]:
-    """3D poses seen from above: x, y, heading of the x axis (N, 3); upside down or not; notes."""
-    heading = np.arctan2(rotation[:, 1, 0], rotation[:, 0, 0])
-    up = np.median(rotation[:, 2, 2])
+def _carried(covariances: FloatArray, poses: FloatArray, mounts: FloatArray) -> FloatArray:
+    """Covariances (N, 3, 3) of frames that are mounted at ``mounts`` (N, 3) on frames at ``poses`` (N, 3)."""
+    cos, sin = np.cos(poses[:, 2]), np.sin(poses[:, 2])
+    turn = np.broadcast_to(np.eye(3), (len(poses), 3, 3)).copy()
+    turn[:, 0, 2] = -(sin * mounts[:, 0] + cos * mounts[:, 1])
+    turn[:, 1, 2] = cos * mounts[:, 0] - sin * mounts[:, 1]
+    carried: FloatArray = turn @ covariances @ turn.transpose(0, 2, 1)
+    return carried
+
+
+def _sensors(sensed: Sensed, estimate: Estimate) -> Iterator[Sensor]:
+    """The sensors that were fused, with the noise that was found."""
+    noise = estimate.noise
+    if sensed.odometry is not None:
+        std = {"m": noise.metres or 0.0, "rad": noise.radians or 0.0}
+        yield Sensor(ODOM, sensed.odometry.topic, len(sensed.odometry.trajectory), 0, std)
+    if sensed.gps is not None:
+        yield Sensor(GPS, sensed.gps.topic, *estimate.used(0), {"m": noise.fixes or 0.0})
+    if sensed.compass is not None:
+        std = {"rad": noise.headings or 0.0}
+        yield Sensor(COMPASS, sensed.compass.topic, *estimate.used(1), std, noise.bias or 0.0)
+
+
+def _fusion_notes(sensors: Sequence[Sensor]) -> tuple[str, ...]:
+    """What a user should know of the sensors that were fused."""
     notes: tuple[str, ...] = ()
-    if abs(up) < MAX_TILT:
-        tilt = np.degrees(np.arccos(min(abs(up), 1.0)))
-        notes = (f"the laser is tilted by {tilt:.0f} degrees: the map shows its plane, not the floor plan",)
-    return np.column_stack((translation[:, :2], heading)), bool(up < 0), notes
-
-
-def _usable(pose: StampedPose) -> bool:
-    return bool(np.isfinite((*pose.translation, *pose.rotation)).all() and np.linalg.norm(pose.rotation) > 1e-3)
-
-
-def _transforms(poses: Sequence[StampedPose], static: bool) -> Transforms:
-    """Transforms sorted by stamp; of several with one stamp the last; of static ones the last alone."""
-    if static:
-        poses = poses[-1:]
-    by_stamp = {pose.stamp: pose for pose in sorted(poses, key=lambda pose: pose.stamp)}
-    rotations = np.array([pose.rotation for pose in by_stamp.values()])
-    return Transforms(
-        np.array(list(by_stamp), dtype=np.int64),
-        np.array([pose.translation for pose in by_stamp.values()]),
-        rotations / np.linalg.norm(rotations, axis=1, keepdims=True),
-        static,
-    )
-
-
-def _slerp(a: FloatArray, b: FloatArray, share: FloatArray) -> FloatArray:
-    """Unit quaternions (N, 4) at ``share`` (N, 1) of the shorter arc from a to b."""
-    cosine = np.einsum("ni,ni->n", a, b)[:, None]
-    b = np.where(cosine < 0, -b, b)
-    angle = np.arccos(np.clip(np.abs(cosine), 0.0, 1.0))
-    sine = np.sin(angle)
-    near = sine < 1e-9
-    safe = np.where(near, 1.0, sine)
-    first = np.where(near, 1 - share, np.sin((1 - share) * angle) / safe)
-    second = np.where(near, share, np.sin(share * angle) / safe)
-    return first * a + second * b
-
-
-def _matrices(quaternions: FloatArray) -> FloatArray:
-    """Rotation matrices (N, 3, 3) of unit quaternions (N, 4) as x, y, z, w."""
-    x, y, z, w = quaternions.T
-    rows = (
-        (1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),
-        (2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)),
-        (2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)),
-    )
-    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
+    if len(sensors) == 1:
+        notes += (f"no GPS and no compass: fused poses are those of {sensors[0].topic}",)
+    for sensor in sensors:
+        if sensor.name != ODOM and not sensor.used:
+            notes += (f"{sensor.topic}: no reading within the time of the poses was used",)
+        elif sensor.rejected > MANY_REJECTED * (sensor.used + sensor.rejected):
+            share = f"{sensor.rejected} of {sensor.used + sensor.rejected}"
+            notes += (f"{sensor.topic}: {share} readings are too far off the other sensors' and were not used",)
+        if sensor.bias:
+            degrees = np.degrees(sensor.bias)
+            notes += (f"{sensor.topic}: headings are off by {degrees:.1f} degrees all the time, which is taken out",)
+    return notes

@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
+
+import numpy as np
 
 from mapping.forward import cores
 from mapping.grid import OccupancyGrid
 from mapping.mapper import Mapper
 from prim.frames import Pose2D, Scan
 from prim.metrics import DetectionErrors, detection_errors
+from prim.raycast import FloatArray
 from prim.shapes import Primitive
 from replay.truth import Truth
 
@@ -54,7 +58,8 @@ class Lookout:
 
     ``own`` is a mapper with cells of the size that the detector reads; None where the replay's own map has them.
     With ``tracker``, for a detector that looks more than once, what is found keeps its id. With ``refines``, what is
-    found is fitted to the rays, whose noise is ``noise_std`` (m) where it is known.
+    found is fitted to the rays, whose noise is ``noise_std`` (m) where it is known; ``frame_covariance`` (3, 3) says
+    how unsure the map's own place is, which adds to what is told of each primitive's.
     """
 
     def __init__(
@@ -65,12 +70,14 @@ class Lookout:
         tracker: Tracker | None = None,
         refines: bool = False,
         noise_std: float | None = None,
+        frame_covariance: FloatArray | None = None,
     ) -> None:
         self._detector = detector
         self._tracker = tracker
         self._own = own
         self._truth = truth
         self._noise_std = noise_std
+        self._frame_covariance = frame_covariance
         self._scans: list[tuple[Scan, Pose2D]] = []
         self._before: Detections | None = None
         self._count, self._stride = 0, 1
@@ -121,14 +128,27 @@ class Lookout:
         from detect.refine import refine_detections  # when it is needed: a replay without it starts faster
 
         if scans is not None:
-            return refine_detections(detections, scans, grid, self._noise_std, cores())
+            refined, noise_std = refine_detections(detections, scans, grid, self._noise_std, cores())
+            return self._in_unsure_frame(refined), noise_std
         anew = self._count >= 2 * self._searched_at
         if anew:
             self._searched_at = self._count
         before = None if anew else self._before
         refined, noise_std = refine_detections(detections, self._scans, grid, self._noise_std, cores(), before)
         self._before = refined
-        return refined, noise_std
+        return self._in_unsure_frame(refined), noise_std
+
+    def _in_unsure_frame(self, detections: Detections) -> Detections:
+        """Detections with what is told of their place and angle as unsure as the map's frame makes it."""
+        if self._frame_covariance is None:
+            return detections
+        found = tuple(
+            one
+            if one.std is None
+            else replace(one, std=spread_by_frame(one.primitive, one.std, self._frame_covariance))
+            for one in detections.found
+        )
+        return replace(detections, found=found)
 
     def sighting(self, detections: Detections, stamp: int, noise_std: float | None = None) -> Sighting:
         """Detections with their identities, held against the truth at ``stamp`` (ns) where there is one."""
@@ -145,6 +165,13 @@ class Lookout:
             return tuple(Identity(number) for number in range(1, len(detections.found) + 1))
         tracks = self._tracker.update(detections.found)
         return tuple(Identity(track.id, track.confirmed, track.std) for track in tracks)
+
+
+def spread_by_frame(primitive: Primitive, std: Mapping[str, float], covariance: FloatArray) -> dict[str, float]:
+    """Standard deviations (m, rad, by name) of a primitive in a frame whose own place has a ``covariance`` (3, 3)."""
+    moved = np.array([[1, 0, -primitive.y], [0, 1, primitive.x], [0, 0, 1]])
+    added = dict(zip(("x", "y", "theta"), np.diag(moved @ covariance @ moved.T).tolist(), strict=True))
+    return {name: math.sqrt(value**2 + added.get(name, 0.0)) for name, value in std.items()}
 
 
 def shipped_weights(mapper: str) -> Path | None:

@@ -19,12 +19,13 @@ from mapping.truth import TruthMap
 from prim.errors import LogReadError, UsageError, WorldError
 from prim.frames import Pose2D, Scan
 from prim.log import LogReader
-from prim.metrics import MapScores, pose_rmse
+from prim.metrics import MapScores, pose_nees, pose_rmse
+from prim.raycast import FloatArray
 from prim.shapes import angle_difference
 from prim.world import Bounds, World
-from replay.localize import STILL, LaserPoses, Localizer
+from replay.localize import FUSED, STILL, FuseOptions, LaserPoses, Localizer
 from replay.lookout import Lookout, Sighting, shipped_weights
-from replay.scans import ScanLog, Selection, counted, turned_over
+from replay.scans import PosedScan, ScanLog, Selection, counted, pieces_of, turned_over
 from replay.show import NullViewer, Scene, Viewer
 from replay.truth import Truth
 
@@ -62,6 +63,8 @@ class ReplayOptions:
     laser_offset: Pose2D | None = None
     max_range: float | None = None
     standing_still: bool = False
+    fuse: FuseOptions = field(default_factory=FuseOptions)
+    deskew: bool = True
     selection: Selection = field(default_factory=Selection)
     rate: float | None = None
     map_every: int | None = None
@@ -89,7 +92,9 @@ class ReplayOptions:
             raise UsageError("--no-detect excludes --detect-every, --weights and --no-refine")
         if self.standing_still and (self.pose != "auto" or self.odom_topic):
             raise UsageError("--standing-still excludes --pose and --odom-topic")
-        if self.odom_topic and self.pose not in ("auto", "odom"):
+        if self.fuse != FuseOptions() and self.pose not in ("auto", FUSED):
+            raise UsageError(f"--fuse, topics of GPS and compass and their noise do not go with --pose {self.pose}")
+        if self.odom_topic and self.pose not in ("auto", "odom", FUSED):
             raise UsageError(f"--odom-topic goes with --pose odom, not with --pose {self.pose}")
         offset = self.laser_offset
         if offset is not None and not (np.abs((offset.x, offset.y, offset.theta)) < MAX_OFFSET).all():
@@ -112,6 +117,7 @@ class ReplayResult:
     poses: LaserPoses
     stamps: NDArray[np.int64]
     pose_rmse: tuple[float, float] | None
+    pose_nees: float | None
     grid: OccupancyGrid
     noise_std: float | None
     scores: MapScores | None
@@ -196,7 +202,7 @@ class Pipeline:
                 poses, true_poses = self._localize(log, scans)
             frame = self._frame(scans, poses, truth)
             judge = Judge(frame, truth, poses, true_poses)
-            lookout = self._lookout(frame, truth if judge.scores_maps else None)
+            lookout = self._lookout(frame, truth if judge.scores_maps else None, poses.frame_covariance)
             mapper = self._mapper(scans, poses, frame)
             scene = Scene(
                 log.path.name,
@@ -219,7 +225,7 @@ class Pipeline:
             if lookout is not None:
                 with self._clock.stage("detect"):
                     seen = lookout.last_map(grid)
-                posed = ((scan, pose) for _, scan, pose in self._posed(scans, poses))
+                posed = (piece for posed in self._posed(scans, poses) for piece in posed.pieces)
                 sighting = self._sighting(lookout, seen, stamp, posed)
             self._note_what_was_used(scans, poses, used, grid)
             result = self._result(log, scans, poses, used, grid, mapper.noise_std, scores, sighting, judge)
@@ -243,16 +249,17 @@ class Pipeline:
     def _localize(self, log: LogReader, scans: ScanLog) -> tuple[LaserPoses, LaserPoses | None]:
         """The laser's poses, and the true ones where the log has them."""
         options = self.options
-        localizer = Localizer(log, options.odom_topic, options.laser_offset)
+        localizer = Localizer(log, options.odom_topic, options.laser_offset, options.fuse)
+        times = scans.times if options.deskew else replace(scans.times, sweep=0)
         if options.standing_still:
-            return localizer.stand_still(scans.times), None
-        poses = localizer.locate(scans.times, options.pose)
+            return localizer.stand_still(times), None
+        poses = localizer.locate(times, options.pose)
         if poses.source == "truth":
             return poses, poses
         if not localizer.has_truth:
             return poses, None
         try:
-            return poses, localizer.locate(scans.times, "truth")
+            return poses, localizer.locate(times, "truth")
         except LogReadError as error:
             self._notes.append(f"the poses are not held against the truth: {error.what}")
             return poses, None
@@ -274,7 +281,8 @@ class Pipeline:
                 (scan.range_min, scan.range_max),
                 1 / self.options.resolution,
             )
-            for _, scan, pose in self._posed(scans, poses)
+            for posed in self._posed(scans, poses)
+            for scan, pose in posed.pieces
         ]
         row, col = np.min([extent[:2] for extent in extents], axis=0).tolist()
         last_row, last_col = np.max([extent[2:] for extent in extents], axis=0).tolist()
@@ -286,7 +294,8 @@ class Pipeline:
         noise_std = options.noise_std
         if options.sensor_model == "gaussian" and noise_std is None:
             every = -(-len(scans) // NOISE_SCANS)
-            some = [(scan, pose) for position, scan, pose in self._posed(scans, poses) if position % every == 0]
+            chosen = (posed for posed in self._posed(scans, poses) if posed.position % every == 0)
+            some = [piece for posed in chosen for piece in posed.pieces]
             with self._clock.stage("map"):
                 noise_std = find_noise(some, frame)
             if noise_std is None:
@@ -297,7 +306,7 @@ class Pipeline:
                 )
         return make_mapper(options.mapper, options.resolution, frame.bounds, options.sensor_model, noise_std)
 
-    def _lookout(self, frame: GridFrame, truth: Truth | None) -> Lookout | None:
+    def _lookout(self, frame: GridFrame, truth: Truth | None, spread: FloatArray | None) -> Lookout | None:
         """What looks for primitives; None, and the reason kept, where it cannot and nobody asked for it by name."""
         options = self.options
         if not options.detect:
@@ -307,14 +316,14 @@ class Pipeline:
         try:
             if weights is None:
                 raise UsageError(f"no weights for maps of {options.mapper} come with prim: give --weights")
-            return self._loaded(weights, frame, truth)
+            return self._loaded(weights, frame, truth, spread)
         except UsageError as error:
             if asked:
                 raise
             self._blind = str(error)
             return None
 
-    def _loaded(self, weights: Path, frame: GridFrame, truth: Truth | None) -> Lookout:
+    def _loaded(self, weights: Path, frame: GridFrame, truth: Truth | None, spread: FloatArray | None) -> Lookout:
         """The detector, with a map of its own where it reads other maps than the one that is made."""
         from detect.detector import Detector  # when it is needed: a replay without detection starts faster
 
@@ -328,13 +337,13 @@ class Pipeline:
             tracker = Tracker()
         cell = detector.card.resolution
         if np.isclose(options.resolution, cell, rtol=1e-6) and options.sensor_model == "eq4":
-            return Lookout(detector, None, truth, tracker, options.refine, options.noise_std)
+            return Lookout(detector, None, truth, tracker, options.refine, options.noise_std, spread)
         noise_std = options.noise_std if options.mapper == "forward" else None
         own = make_mapper(options.mapper, cell, GridFrame.covering(frame.bounds, cell).bounds, "eq4", noise_std)
-        return Lookout(detector, own, truth, tracker, options.refine, options.noise_std)
+        return Lookout(detector, own, truth, tracker, options.refine, options.noise_std, spread)
 
-    def _posed(self, scans: ScanLog, poses: LaserPoses) -> Iterator[tuple[int, Scan, Pose2D]]:
-        """The scans that have a pose: position, scan as seen from above, pose of the laser."""
+    def _posed(self, scans: ScanLog, poses: LaserPoses) -> Iterator[PosedScan]:
+        """The scans that have a pose, as seen from above."""
         source = iter(scans)
         while True:
             with self._clock.stage("read"):
@@ -343,8 +352,9 @@ class Pipeline:
                 return
             position, scan = item
             if poses.valid[position]:
-                pose = Pose2D(*poses.poses[position].tolist())
-                yield position, self._prepared(scan, poses.upside_down), pose
+                seen = self._prepared(scan, poses.upside_down)
+                pose, end = poses.at(position), poses.end(position)
+                yield PosedScan(position, seen, pose, pieces_of(seen, pose, end, self.options.resolution / 2))
 
     def _prepared(self, scan: Scan, upside_down: bool) -> Scan:
         """The scan as seen from above, and no further than the largest range in use."""
@@ -398,22 +408,24 @@ class Pipeline:
         pace = Pace(self.options.rate)
         every = self.options.detect_every if lookout else None
         add = mapper.update if map_every or every else mapper.keep
-        for position, scan, pose in self._posed(scans, poses):
+        for posed in self._posed(scans, poses):
+            position, scan = posed.position, posed.scan
             stamp = int(scans.stamps[position])
             pace.wait(stamp)
             start = time.perf_counter()
             with self._clock.stage("map"):
-                add(scan, pose)
+                for piece, pose in posed.pieces:
+                    add(piece, pose)
             seconds = time.perf_counter() - start
             judge.update(position, scan, stamp)
             used.count(scan)
             if lookout is not None:
-                self._look(lookout, mapper, position, stamp, scan, pose)
+                self._look(lookout, mapper, posed, stamp)
             with self._clock.stage("viewer"):
                 if truth is not None and truth.at(stamp) is not shown:
                     shown = truth.at(stamp)
                     self.viewer.show_truth(position, stamp, shown)
-                self.viewer.show_scan(position, stamp, pose, scan, seconds)
+                self.viewer.show_scan(position, stamp, posed.pose, posed.points, seconds)
                 error = judge.pose_error(position)
                 if error is not None:
                     self.viewer.show_pose_error(position, stamp, *error)
@@ -426,17 +438,18 @@ class Pipeline:
             self._progress(position + 1, len(scans))
         return used
 
-    def _look(self, lookout: Lookout, mapper: Mapper, position: int, stamp: int, scan: Scan, pose: Pose2D) -> None:
+    def _look(self, lookout: Lookout, mapper: Mapper, posed: PosedScan, stamp: int) -> None:
         """Shows the detector a scan and, where it is time, lets it look."""
         every = self.options.detect_every
         with self._clock.stage("detect"):
-            (lookout.update if every else lookout.keep)(scan, pose)
-            if not every or (position + 1) % every:
+            for scan, pose in posed.pieces:
+                (lookout.update if every else lookout.keep)(scan, pose)
+            if not every or (posed.position + 1) % every:
                 return
             seen = lookout.map_so_far(mapper)
         sighting = self._sighting(lookout, seen, stamp)
         with self._clock.stage("viewer"):
-            self.viewer.show_sighting(position, stamp, sighting)
+            self.viewer.show_sighting(posed.position, stamp, sighting)
 
     def _sighting(
         self, lookout: Lookout, seen: OccupancyGrid, stamp: int, posed: Iterable[tuple[Scan, Pose2D]] | None = None
@@ -476,6 +489,7 @@ class Pipeline:
             poses=poses,
             stamps=scans.stamps,
             pose_rmse=judge.pose_rmse(),
+            pose_nees=judge.pose_nees(),
             grid=grid,
             noise_std=noise_std,
             scores=scores,
@@ -530,6 +544,15 @@ class Judge:
             return None
         both = self._poses.valid & self._true_poses.valid
         return pose_rmse(self._poses.poses[both], self._true_poses.poses[both]) if both.any() else None
+
+    def pose_nees(self) -> float | None:
+        """The mean normalised error squared: 3 where the covariances are right; None where there are none."""
+        if self._true_poses is None or self._poses.covariances is None:
+            return None
+        both = self._poses.valid & self._true_poses.valid
+        if not both.any():
+            return None
+        return pose_nees(self._poses.poses[both], self._true_poses.poses[both], self._poses.covariances[both])
 
 
 class Pace:

@@ -16,6 +16,7 @@ from mapping.grid import OccupancyGrid
 from prim.errors import OutputError
 from prim.metrics import DetectionErrors
 from prim.shapes import Kind
+from replay.localize import COMPASS, ODOM, LaserPoses, Sensor
 from replay.lookout import Sighting
 from replay.pipeline import ReplayResult
 from replay.scans import counted
@@ -48,7 +49,7 @@ def report(result: ReplayResult) -> dict[str, Any]:
             "messages_lost": result.messages_lost,
             "recovered": bool(result.lost),
         },
-        "pose": {"source": result.poses.source, "rmse_m": rmse[0], "rmse_rad": rmse[1]},
+        "pose": {"source": result.poses.source, "rmse_m": rmse[0], "rmse_rad": rmse[1]} | _pose_spread(result),
         "map": {
             "mapper": result.options.mapper,
             "resolution_m": frame.resolution,
@@ -67,6 +68,38 @@ def report(result: ReplayResult) -> dict[str, Any]:
             "x_realtime": result.duration / seconds["total"] if seconds["total"] else None,
         },
     }
+
+
+def _pose_spread(result: ReplayResult) -> dict[str, Any]:
+    """How sure the poses are (root mean squares), and what they were fused from; nulls where nobody knows.
+
+    ``nees`` is the mean normalised error squared, 3 where the covariances are right.
+    """
+    std = pose_std(result.poses)
+    return {
+        "std_m": std and std[0],
+        "std_rad": std and std[1],
+        "nees": result.pose_nees,
+        "sensors": {
+            sensor.name: {
+                "topic": sensor.topic,
+                "used": sensor.used,
+                "rejected": sensor.rejected,
+                **{f"std_{unit}": value for unit, value in sensor.std.items()},
+                **({"bias_rad": sensor.bias} if sensor.name == COMPASS else {}),
+            }
+            for sensor in result.poses.sensors
+        }
+        or None,
+    }
+
+
+def pose_std(poses: LaserPoses) -> tuple[float, float] | None:
+    """Root mean squares of the poses' standard deviations: of places (m, both axes together) and headings (rad)."""
+    if poses.covariances is None or not poses.valid.any():
+        return None
+    variances = poses.covariances[poses.valid].diagonal(axis1=1, axis2=2).mean(axis=0)
+    return float(np.sqrt(variances[:2].sum())), float(np.sqrt(variances[2]))
 
 
 def _primitives(sighting: Sighting | None) -> list[dict[str, Any]]:
@@ -191,9 +224,14 @@ def table(result: ReplayResult) -> list[tuple[str, str]]:
     ]
     if result.noise_std is not None:
         rows.append(("range noise", _noise(result.noise_std, result.options.noise_std is not None, frame.resolution)))
+    if result.poses.sensors:
+        rows.append(("pose noise", "; ".join(_sensor_noise(sensor) for sensor in result.poses.sensors)))
+    std = pose_std(result.poses)
+    expected = f", expected {_length_and_turn(*std)}" if std else ""
     if result.pose_rmse is not None:
-        metres, radians = result.pose_rmse
-        rows.append(("pose error", f"{metres * 1000:.1f} mm, {np.degrees(radians):.2f} deg (RMS)"))
+        rows.append(("pose error", f"{_length_and_turn(*result.pose_rmse)} (RMS){expected}"))
+    elif std:
+        rows.append(("pose std", f"{_length_and_turn(*std)} (RMS)"))
     if scores is not None:
         rows += [
             ("occupied", f"precision {_percent(scores.occupied_precision)}, recall "
@@ -213,6 +251,20 @@ def table(result: ReplayResult) -> list[tuple[str, str]]:
     rate = result.rays / seconds["map"] / 1e6 if seconds["map"] else 0.0
     rows.append(("time", f"{seconds['total']:.2f} s, mapping {seconds['map']:.3f} s ({rate:.2f} M rays/s)"))
     return rows
+
+
+def _length_and_turn(metres: float, radians: float) -> str:
+    return f"{metres * 1000:.1f} mm, {np.degrees(radians):.2f} deg"
+
+
+def _sensor_noise(sensor: Sensor) -> str:
+    """A sensor's noise in words."""
+    values = [f"{1000 * sensor.std['m']:.0f} mm"] if "m" in sensor.std else []
+    values += [f"{np.degrees(sensor.std['rad']):.1f} deg"] if "rad" in sensor.std else []
+    what = f"{sensor.name} {', '.join(values)}"
+    if sensor.name == ODOM:
+        return f"{what} after 1 m"
+    return f"{what} ({sensor.rejected} of {sensor.used + sensor.rejected} not used)" if sensor.rejected else what
 
 
 def _counted(sighting: Sighting) -> str:

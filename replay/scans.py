@@ -3,17 +3,25 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
 
 from prim.errors import LogReadError, UsageError
-from prim.frames import Scan, Stamps
+from prim.frames import Pose2D, Scan, Stamps, wrap_angle
 from prim.log import LogReader, Topic
 from prim.messages import SCAN_TYPE, decode_scan, decode_stamp
+from prim.raycast import FloatArray
 from replay.localize import ScanTimes
+
+LONGEST_SWEEP = 10.0
+"""No laser takes longer (s) for a turn."""
+
+MOST_PIECES = 64
+"""A scan whose laser moves meanwhile is cut into no more pieces."""
 
 
 @dataclass(frozen=True)
@@ -76,7 +84,13 @@ class ScanLog:
     @property
     def times(self) -> ScanTimes:
         """When the selected scans were taken, and in which frame."""
-        return ScanTimes(self.stamps, self.first.frame_id)
+        return ScanTimes(self.stamps, self.first.frame_id, self.sweep)
+
+    @property
+    def sweep(self) -> int:
+        """The time (ns) from a scan's first beam to its last; 0 where the log does not say, or nothing sensible."""
+        seconds = self.first.time_increment * (len(self.first.ranges) - 1)
+        return round(seconds * 1e9) if 0 < seconds <= LONGEST_SWEEP else 0
 
     @property
     def duration(self) -> float:
@@ -120,6 +134,51 @@ class ScanLog:
     def _none_usable(self) -> Scan:
         reasons = "; ".join([*self.notes(), *self._log.lost])
         raise LogReadError(self._log.path, f"no scan on {self.topic.name} can be used: {reasons}")
+
+
+@dataclass(frozen=True)
+class PosedScan:
+    """A scan, the laser's pose at its first beam, and the same in ``pieces`` that have a pose of their own each."""
+
+    position: int
+    scan: Scan
+    pose: Pose2D
+    pieces: Sequence[tuple[Scan, Pose2D]]
+
+    @property
+    def points(self) -> FloatArray:
+        """End points (M, 2) in the map frame of the beams that hit."""
+        return np.concatenate([scan.points(pose) for scan, pose in self.pieces])
+
+
+def pieces_of(scan: Scan, pose: Pose2D, end: Pose2D | None, tolerance: float) -> list[tuple[Scan, Pose2D]]:
+    """A scan cut so that each piece's beams are seen from where the laser then was.
+
+    ``end`` is the laser's pose at the last beam, None where it did not move. In between it moves evenly; within a
+    piece, it moves what it sees by no more than ``tolerance`` (m), unless there were more than MOST_PIECES pieces.
+    """
+    if end is None:
+        return [(scan, pose)]
+    dx, dy, turn = end.x - pose.x, end.y - pose.y, wrap_angle(end.theta - pose.theta)
+    hits = scan.ranges[scan.hits]
+    reach = float(hits.max()) if len(hits) else 0.0
+    count = min(math.ceil((math.hypot(dx, dy) + abs(turn) * reach) / tolerance), MOST_PIECES, len(scan.ranges))
+    if count <= 1:
+        return [(scan, pose)]
+    edges = np.linspace(0, len(scan.ranges), count + 1).astype(int).tolist()
+    last = max(len(scan.ranges) - 1, 1)
+    pieces = []
+    for first, after in pairwise(edges):
+        share = (first + after - 1) / 2 / last
+        piece = replace(
+            scan,
+            stamp=scan.stamp + round(first * scan.time_increment * 1e9),
+            angle_min=scan.angle_min + first * scan.angle_increment,
+            ranges=scan.ranges[first:after],
+        )
+        at = Pose2D(pose.x + share * dx, pose.y + share * dy, wrap_angle(pose.theta + share * turn), pose.covariance)
+        pieces.append((piece, at))
+    return pieces
 
 
 def counted(count: int, what: str) -> str:

@@ -8,8 +8,9 @@ from typing import TYPE_CHECKING, Protocol
 
 from mapping.grid import OccupancyGrid
 from prim.errors import UsageError
-from prim.frames import Pose2D, Scan
+from prim.frames import Pose2D
 from prim.metrics import MapScores
+from prim.raycast import FloatArray
 from prim.world import Bounds, World
 
 if TYPE_CHECKING:
@@ -75,8 +76,8 @@ class Viewer(Protocol):
     def show_truth(self, position: int, stamp: int, world: World) -> None:
         """The true world from now on."""
 
-    def show_scan(self, position: int, stamp: int, pose: Pose2D, scan: Scan, seconds: float) -> None:
-        """A scan, the laser's pose in the map frame, and the mapper's seconds for it."""
+    def show_scan(self, position: int, stamp: int, pose: Pose2D, points: FloatArray, seconds: float) -> None:
+        """The laser's pose, a scan's end points (M, 2) in the map frame, and the mapper's seconds for it."""
 
     def show_map(self, position: int, stamp: int, grid: OccupancyGrid, scores: MapScores | None) -> None:
         """The map so far and its scores against the truth."""
@@ -108,7 +109,7 @@ class NullViewer:
     def show_truth(self, position: int, stamp: int, world: World) -> None:
         """Nothing."""
 
-    def show_scan(self, position: int, stamp: int, pose: Pose2D, scan: Scan, seconds: float) -> None:
+    def show_scan(self, position: int, stamp: int, pose: Pose2D, points: FloatArray, seconds: float) -> None:
         """Nothing."""
 
     def show_map(self, position: int, stamp: int, grid: OccupancyGrid, scores: MapScores | None) -> None:

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from mapping.grid import OccupancyGrid
 from prim.errors import OutputError, PrimError, UsageError
-from prim.frames import Pose2D, Scan
+from prim.frames import Pose2D
 from prim.metrics import DetectionErrors, MapScores
 from prim.raycast import FloatArray
 from prim.shapes import Kind, Primitive
@@ -101,6 +101,9 @@ LENGTHS = {
 
 CROPS_IN_A_ROW = 6
 
+CHI_SQUARED = 5.991
+"""Two normal numbers' squares add up to less with 95 % chance."""
+
 
 class RerunViewer:
     """Draws a replay as a rerun recording, which is opened when the replay begins.
@@ -162,11 +165,11 @@ class RerunViewer:
             strips = list(self._lifted(np.asarray(world.walls).reshape(-1, 2, 2), TRUTH_LIFT))
             self._recording.log("map/truth/walls", rr.LineStrips3D(strips, colors=[TRUTH_COLOR], radii=radius))
 
-    def show_scan(self, position: int, stamp: int, pose: Pose2D, scan: Scan, seconds: float) -> None:
-        """A scan, the laser's pose in the map frame, and the mapper's seconds for it."""
+    def show_scan(self, position: int, stamp: int, pose: Pose2D, points: FloatArray, seconds: float) -> None:
+        """The laser's pose, a scan's end points (M, 2) in the map frame, and the mapper's seconds for it."""
         if not self._batch:
             self._batch_started = time.perf_counter()
-        self._batch.append(_ScanEntry(position, stamp, pose, scan.points(pose), seconds))
+        self._batch.append(_ScanEntry(position, stamp, pose, points, seconds))
         self._trail.append((pose.x, pose.y))
         old = time.perf_counter() - self._batch_started > BATCH_SECONDS
         if self._options.live or len(self._batch) >= BATCH_SCANS or (old and self._options.watched):
@@ -305,6 +308,7 @@ class RerunViewer:
             index = _index([(entry.position, entry.stamp) for entry in entries])
             self._send_scans(index, entries)
             self._send_lasers(index, entries)
+            self._send_ellipses(entries)
             milliseconds = [entry.seconds * 1e3 for entry in entries]
             self._columns("timing", index, rr.Scalars.columns(scalars=milliseconds))
             self._send_trail(entries[-1])
@@ -337,6 +341,17 @@ class RerunViewer:
         vectors = [(length * math.cos(pose.theta), length * math.sin(pose.theta), 0.0) for pose in poses]
         self._columns("map/laser", index, rr.Arrows3D.columns(vectors=vectors, origins=origins))
         self._static_once("map/laser", rr.Arrows3D.from_fields(colors=[LASER_COLOR], radii=rr.Radius.ui_points(2.5)))
+
+    def _send_ellipses(self, entries: list[_ScanEntry]) -> None:
+        """Where the laser is with 95 % chance, where its pose has a covariance."""
+        sure = [entry for entry in entries if entry.pose.covariance is not None]
+        if sure:
+            rings = [self._lifted(confidence_ellipse(entry.pose), TRUTH_LIFT) for entry in sure]
+            index = _index([(entry.position, entry.stamp) for entry in sure])
+            columns = rr.LineStrips3D.columns(strips=rings).partition([1] * len(rings))
+            self._columns("map/laser_95_percent", index, columns)
+            look = rr.LineStrips3D.from_fields(colors=[LASER_COLOR], radii=rr.Radius.ui_points(1.0))
+            self._static_once("map/laser_95_percent", look)
 
     def _static_once(self, path: str, what: Any) -> None:
         """Looks that stay the same are sent once."""
@@ -414,6 +429,17 @@ def _series(origin: str, name: str, **properties: Any) -> rrb.TimeSeriesView:
 def _values(errors: DetectionErrors, series: Iterable[str], unit: float) -> list[float]:
     """Some of the errors, in a plot's units; what there is not leaves a gap."""
     return [math.nan if (value := getattr(errors, name)) is None else unit * value for name in series]
+
+
+def confidence_ellipse(pose: Pose2D) -> FloatArray:
+    """The ring (33, 2) around a pose's place that holds the true one with 95 % chance."""
+    assert pose.covariance is not None
+    spread, axes = np.linalg.eigh(pose.covariance[:2, :2])
+    angle = np.linspace(0, 2 * np.pi, 33)
+    radii = np.sqrt(CHI_SQUARED * np.maximum(spread, 0.0))
+    ring: FloatArray = np.column_stack((radii[0] * np.cos(angle), radii[1] * np.sin(angle))) @ axes.T
+    ring += pose.x, pose.y
+    return ring
 
 
 def _detections_table(sighting: Sighting) -> str:

@@ -22,7 +22,8 @@ from prim.messages import (
     encode_scan,
     encode_transforms,
 )
-from replay.localize import Localizer, ScanTimes, TransformTree
+from replay.localize import Localizer, ScanTimes
+from replay.transforms import TransformTree
 
 SECOND = 10**9
 STAMPS = np.array([SECOND, SECOND + SECOND // 2, 2 * SECOND])
