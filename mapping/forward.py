@@ -20,7 +20,19 @@ from numpy.typing import NDArray
 
 from mapping.calibration import occupancy
 from mapping.grid import UNKNOWN, GridFrame, Layer, OccupancyGrid
-from mapping.level import ALL, COLUMNS, Choice, Level, Noise, Rays, Totals, cells_within, evidence_of, smoothing_width
+from mapping.level import (
+    ALL,
+    COLUMNS,
+    NEGLIGIBLE,
+    Choice,
+    Level,
+    Noise,
+    Rays,
+    Totals,
+    cells_within,
+    evidence_of,
+    smoothing_width,
+)
 from mapping.rays import end_extent
 from prim.errors import UsageError
 from prim.frames import Pose2D, Scan
@@ -101,8 +113,8 @@ class ForwardMapper:
     (by default what neighbouring beams show). Bounds as in :class:`mapping.deterministic.DeterministicMapper`.
     ``threads`` work side by side (by default one for each core) and give the same bits in any number.
 
-    While scans stream in, a coarser map is kept up to date with a bounded amount of work for each; ``grid()`` is
-    made of it, ``finish()`` fits from coarse to fine until TOLERANCE or PASSES.
+    While scans stream in, a coarser map (of at most ``stream_cells``) is kept up to date with a bounded amount of
+    work for each; ``grid()`` is made of it, ``finish()`` fits from coarse to fine until TOLERANCE or PASSES.
     """
 
     name = "forward"
@@ -114,6 +126,7 @@ class ForwardMapper:
         noise_std: float | None = None,
         start_std: float | None = None,
         threads: int | None = None,
+        stream_cells: int = STREAM_CELLS,
     ) -> None:
         self.resolution = resolution
         if noise_std is not None and not 0 < noise_std < math.inf:
@@ -124,6 +137,7 @@ class ForwardMapper:
         self._start = start_std
         self._rays = Rays()
         self._threads = threads or cores()
+        self._stream_cells = stream_cells
         self._stream: Stream | None = None
         self._noise = Noise(noise_std or start_std or 10 * resolution)
         self._learned = False
@@ -182,6 +196,10 @@ class ForwardMapper:
         assert coarse.evidence is not None
         return OccupancyGrid(frame, coarse.probability[cells], coarse.evidence[cells] / np.float32(ratio))
 
+    def so_far(self) -> tuple[Level, Noise] | None:
+        """The coarser map that is kept while scans come in, and the noise; None before there is any."""
+        return None if self._stream is None else (self._stream.level, self._noise)
+
     def finish(self) -> OccupancyGrid:
         """The map of all scans, fitted until nothing changes much."""
         return self.fit().grid()
@@ -189,15 +207,23 @@ class ForwardMapper:
     def fit(self) -> Fit:
         """The fit itself, before it is turned into occupancy."""
         with workers(self._threads) as pool:
-            level, self._noise = self._fit(pool)
+            level, self._noise = self._fit(pool, self._frame())
             return self._read(level, self._noise)
+
+    def settle(self) -> None:
+        """Fits the coarser map that is kept while scans come in to all of them so far, as :meth:`finish` would."""
+        finest, coarse = self._layer.frame, self._stream_frame()
+        with workers(self._threads) as pool:
+            level, self._noise = self._fit(pool, finest, round(coarse.resolution / finest.resolution))
+        self._stream = Stream(coarse, None)
+        self._stream.begin_from(level, self._rays, self._noise)
 
     def _frame(self) -> GridFrame:
         return self._layer.used or self._layer.frame
 
     def _stream_frame(self) -> GridFrame:
         frame, factor = self._layer.frame, 2
-        while frame.rows * frame.cols > STREAM_CELLS * factor**2:
+        while frame.rows * frame.cols > self._stream_cells * factor**2:
             factor *= 2
         return coarser(frame, factor)
 
@@ -208,17 +234,19 @@ class ForwardMapper:
         guess = max(neighbour_noise(self._rays.rays[:, 2]) or 0.0, self.resolution)
         return Noise(min(max(self._start or guess, guess), MOST_START * guess))
 
-    def _fit(self, pool: ThreadPoolExecutor | None) -> tuple[Level, Noise]:
-        """From coarse to fine; then the noise from rays held out, and the map from all of them."""
+    def _fit(self, pool: ThreadPoolExecutor | None, frame: GridFrame, last: int = 1) -> tuple[Level, Noise]:
+        """From coarse to fine, down to cells ``last`` times the frame's; then the noise from rays held out, and the
+        map from all of them.
+        """
         self.history.clear()
         self._learned = False
         learns, many = self._fixed is None, len(self._rays) > THIN_RAYS
         holds_out = learns and len(self._rays) >= HELD_OUT_RAYS
-        frame = self._frame()
         noise = self._first_noise(self.resolution)
         guess = neighbour_noise(self._rays.rays[:, 2]) or 0.0
         level: Level | None = None
-        for factor in factors(noise.std / self.resolution):
+        spread = noise.std / self.resolution
+        for factor in [factor for factor in factors(spread) if factor >= last] or [last]:
             finer = Level(coarser(frame, factor), START * factor, pool)
             noise = noise if learns else self._first_noise(finer.frame.resolution)
             finer.smooth(noise.std)
@@ -306,6 +334,14 @@ class Stream:
     def fit(self, noise: Noise) -> Fit:
         """The map so far, at this level's resolution."""
         return read(self.level, self._sums, noise)
+
+    def begin_from(self, fitted: Level, rays: Rays, noise: Noise) -> None:
+        """Takes over a fitted map with the same cells, and what all rays say of it."""
+        self.level.smooth(noise.std)
+        self.level.restore(np.maximum(fitted.parameters, np.float32(NEGLIGIBLE)))  # what is 0 would stay 0
+        self._sums, totals = self.level.expect(rays, noise, certain=True)
+        self._done, self._next = len(rays), 0
+        self.learned = totals.tell_noise
 
     def take(self, rays: Rays, noise: Noise, fixed: bool) -> Noise:
         """Looks at the newest rays and at some old ones, makes one M step, and returns the noise so far.

@@ -320,6 +320,150 @@ def is_chosen(number: Any, stride: int, held_out: int) -> bool:
     return number % stride == 0 and (held_out == 0 or (number % HOLD_OUT == 0) == (held_out < 0))
 
 
+@part
+def follow(
+    x: float,
+    y: float,
+    beam: Any,
+    limits: Any,
+    stopping: Any,
+    lead: int,
+    spread: float,
+    epsilon: float,
+    table: Any,
+    where: Any,
+    chance: Any,
+    apart: Any,
+    share: Any,
+) -> tuple[Any, ...]:
+    """One ray from (x, y): what it crosses, and how likely what it measured is.
+
+    ``beam`` is its direction and range (-inf: nearer than range_min, inf: no return), ``limits`` are range_min and
+    range_max, ``lead`` is how many of its first cells are passed over. Fills ``where``, ``chance``, ``apart`` (as
+    :func:`walk`) and ``share`` (as :func:`weigh_range`).
+
+    Returns what was measured, how many cells it came to (-1: it misses the grid), the factor of their shares in the
+    density, the likelihood of what lies beyond them, that of a wild measurement, and the density of them all.
+    """
+    rows, cols = stopping.shape
+    flat = stopping.reshape(-1)
+    z_min, z_max = limits
+    inverse_spread = 1 / spread
+    if not (-FAR_CELLS < x < cols + FAR_CELLS and -FAR_CELLS < y < rows + FAR_CELLS):
+        return 0, -1, 0.0, 0.0, 0.0, 1.0
+    first, last, start, major, minor, offset, tilt, s0, ds = lay(x, y, beam[0], beam[1], rows, cols)
+    if first > last:
+        return 0, -1, 0.0, 0.0, 0.0, 1.0
+    kind, z, furthest = measured(beam[2], z_min, z_max, spread)
+    entry = 0.0 if 0 <= x < cols and 0 <= y < rows else s0 + (first - 0.5) * ds
+    exit_at = s0 + (last + 0.5) * ds
+    leaves = exit_at <= furthest
+    stop = last if leaves else min(last, int((furthest - s0) / ds))
+    line = (first + lead, start, major, minor, offset, tilt)
+    x_start, x_step = np.float32((s0 - z) * inverse_spread), np.float32(ds * inverse_spread)
+    comes = np.float32(1.0 if entry <= 0 else 1 - BEFORE)
+    count, left = walk(line, stop, comes, x_start, x_step, flat, where, chance, apart)
+    gone = 0.0
+    if left >= SPENT and leaves:
+        gone = left * beyond(kind, z, z_min, z_max, exit_at, spread, table)
+    elif left >= SPENT and kind == NO_RETURN:
+        gone = float(left)
+    if kind == MEASURED:
+        scale = PEAK * inverse_spread
+        total = weigh_range(count, where, chance, apart, flat, share)
+    else:
+        scale = 1.0
+        total = weigh_cut(kind, count, where, chance, apart, flat, table, share)
+    wildness = epsilon * wild(kind, z_min, z_max)
+    ahead = before(kind, z, z_min, z_max, entry, spread, table)
+    density = (1 - epsilon) * (total * scale + gone + ahead) + wildness
+    return kind, count, scale, gone, wildness, density
+
+
+@kernel
+def look(
+    rays: Any,
+    pose: Any,
+    mount: Any,
+    limits: Any,
+    nudges: Any,
+    corner: Any,
+    resolution: float,
+    stopping: Any,
+    sigma: float,
+    epsilon: float,
+    table: Any,
+    found: Any,
+) -> None:
+    """How likely a scan is from a robot at ``pose`` (3,), and how that changes with the pose.
+
+    ``rays`` (N, 5): where each beam starts (x, y), its direction, and its range, in the frame of the laser, which is
+    mounted on the robot at ``mount`` (3,). ``limits`` are range_min and range_max (m); ``nudges`` (3,) the steps
+    (m, m, rad) of the differences. The map is given as in :func:`expect`. Where ``nudges`` are zero the likelihood
+    alone is found.
+
+    Fills ``found`` (11,): log-likelihood, its slope (3), the information as six numbers xx, xy, xt, yy, yt, tt (sums
+    of products of single rays' slopes: Berndt, Hall, Hall and Hausman 1974), and how many rays said anything.
+    """
+    longest = stopping.shape[0] + stopping.shape[1] + CHUNK
+    where, share = np.empty(longest, np.int64), np.empty(longest, np.float32)
+    apart, chance = np.empty(longest, np.float32), np.empty(longest, np.float32)
+    per_metre, spread = 1 / resolution, sigma / resolution
+    cells = (limits[0] * per_metre, limits[1] * per_metre)
+    slope, places = np.empty(3), np.empty((7, 4))
+    found[:] = 0.0
+    looks = 7 if nudges[0] > 0 else 1
+    for k in range(looks):
+        x, y, theta = pose[0], pose[1], pose[2]
+        if k:
+            change = nudges[(k - 1) // 2] if k % 2 else -nudges[(k - 1) // 2]
+            if k < 3:
+                x += change
+            elif k < 5:
+                y += change
+            else:
+                theta += change
+        cos, sin = math.cos(theta), math.sin(theta)
+        places[k, 0] = (x + cos * mount[0] - sin * mount[1] - corner[0]) * per_metre
+        places[k, 1] = (y + sin * mount[0] + cos * mount[1] - corner[1]) * per_metre
+        places[k, 2], places[k, 3] = math.cos(theta + mount[2]), math.sin(theta + mount[2])
+    for i in range(len(rays)):
+        here = 0.0
+        counts = True
+        for k in range(looks):
+            cos, sin = places[k, 2], places[k, 3]
+            x = places[k, 0] + (cos * rays[i, 0] - sin * rays[i, 1]) * per_metre
+            y = places[k, 1] + (sin * rays[i, 0] + cos * rays[i, 1]) * per_metre
+            dx, dy = cos * rays[i, 2] - sin * rays[i, 3], sin * rays[i, 2] + cos * rays[i, 3]
+            beam = (dx, dy, rays[i, 4] * per_metre)
+            kind, count, _, _, _, density = follow(
+                x, y, beam, cells, stopping, 0, spread, epsilon, table, where, chance, apart, share
+            )
+            counts = counts and count >= 0
+            log_density = math.log(density * per_metre if kind == MEASURED else density)
+            if k == 0:
+                here = log_density
+            elif k % 2:
+                slope[(k - 1) // 2] = log_density
+            else:
+                slope[(k - 1) // 2] = (slope[(k - 1) // 2] - log_density) / (2 * nudges[(k - 1) // 2])
+        if not counts:
+            continue
+        found[0] += here
+        found[10] += 1
+        if looks > 1:
+            a, b, c = slope[0], slope[1], slope[2]
+            found[1] += a
+            found[2] += b
+            found[3] += c
+            found[4] += a * a
+            found[5] += a * b
+            found[6] += a * c
+            found[7] += b * b
+            found[8] += b * c
+            found[9] += c * c
+
+
 @kernel
 def expect(
     scans: Any,
@@ -353,14 +497,11 @@ def expect(
     sum of squares of the rays' chances to have come to the cell (CERTAIN). ``totals`` (6,) float64 gets
     LOG_LIKELIHOOD, the expected STOPS, their SQUARES ((z - s)^2 in sigma^2), expected WILD, RAYS and VISITS.
     """
-    rows, cols = stopping.shape
-    flat = stopping.reshape(-1)
     certain = sums.shape[1] > 2
-    longest = rows + cols + CHUNK
+    longest = stopping.shape[0] + stopping.shape[1] + CHUNK
     where, share = np.empty(longest, np.int64), np.empty(longest, np.float32)
     apart, chance = np.empty(longest, np.float32), np.empty(longest, np.float32)
     per_metre, spread = 1 / resolution, sigma / resolution
-    inverse_spread = 1 / spread
     scan = np.searchsorted(first_rays, begin, side="right") - 1
     for i in range(begin, end):
         while i >= first_rays[scan + 1]:
@@ -368,38 +509,14 @@ def expect(
         if not is_chosen(i + scan, stride, held_out):
             continue
         x, y = (scans[scan, 0] - corner[0]) * per_metre, (scans[scan, 1] - corner[1]) * per_metre
-        z_min, z_max = scans[scan, 2] * per_metre, scans[scan, 3] * per_metre
-        z = float(rays[i, 2]) * per_metre
-        if not (-FAR_CELLS < x < cols + FAR_CELLS and -FAR_CELLS < y < rows + FAR_CELLS):
-            continue
-        first, last, start, major, minor, offset, tilt, s0, ds = lay(
-            x, y, float(rays[i, 0]), float(rays[i, 1]), rows, cols
+        limits = (scans[scan, 2] * per_metre, scans[scan, 3] * per_metre)
+        beam = (float(rays[i, 0]), float(rays[i, 1]), float(rays[i, 2]) * per_metre)
+        lead = leads[i] if len(leads) else 0
+        kind, count, scale, gone, wildness, density = follow(
+            x, y, beam, limits, stopping, lead, spread, epsilon, table, where, chance, apart, share
         )
-        if first > last:
+        if count < 0:
             continue
-        kind, z, furthest = measured(z, z_min, z_max, spread)
-        entry = 0.0 if 0 <= x < cols and 0 <= y < rows else s0 + (first - 0.5) * ds
-        exit_at = s0 + (last + 0.5) * ds
-        leaves = exit_at <= furthest
-        stop = last if leaves else min(last, int((furthest - s0) / ds))
-        line = (first + (leads[i] if len(leads) else 0), start, major, minor, offset, tilt)
-        x_start, x_step = np.float32((s0 - z) * inverse_spread), np.float32(ds * inverse_spread)
-        comes = np.float32(1.0 if entry <= 0 else 1 - BEFORE)
-        count, left = walk(line, stop, comes, x_start, x_step, flat, where, chance, apart)
-        gone = 0.0
-        if left >= SPENT and leaves:
-            gone = left * beyond(kind, z, z_min, z_max, exit_at, spread, table)
-        elif left >= SPENT and kind == NO_RETURN:
-            gone = float(left)
-        if kind == MEASURED:
-            scale = PEAK * inverse_spread
-            total = weigh_range(count, where, chance, apart, flat, share)
-        else:
-            scale = 1.0
-            total = weigh_cut(kind, count, where, chance, apart, flat, table, share)
-        wildness = epsilon * wild(kind, z_min, z_max)
-        ahead = before(kind, z, z_min, z_max, entry, spread, table)
-        density = (1 - epsilon) * (total * scale + gone + ahead) + wildness
         weight = (1 - epsilon) / density
         factor = np.float32(scale * weight)
         if kind == MEASURED:

@@ -85,6 +85,9 @@ def replay(
         tuple[float, float] | None,
         typer.Option(metavar="M DEG", help="Odometry's std after a metre of way. [default: found from the log]"),
     ] = None,
+    match_scans: Annotated[
+        bool, typer.Option("--match-scans", help="Correct the poses by matching scans with a map of them all.")
+    ] = False,
     no_deskew: Annotated[
         bool, typer.Option("--no-deskew", help="Take all beams of a scan as measured at its stamp.")
     ] = False,
@@ -186,6 +189,7 @@ def replay(
         standing_still=standing_still,
         fuse=_fuse_options(fuse, gps_topic, compass_topic, pose_noise, odom_noise),
         deskew=not no_deskew,
+        match_scans=match_scans,
         selection=Selection(start, end, duration, n_scans, stride),
         rate=rate,
         map_every=map_every,

@@ -90,6 +90,18 @@ class Nodes:
         """At which nodes there is a heading."""
         return ~np.isnan(self.headings)
 
+    def part(self, begin: int, end: int | None) -> Nodes:
+        """The nodes from ``begin`` to ``end``."""
+        piece = slice(begin, end)
+        return replace(
+            self,
+            stamps=self.stamps[piece],
+            steps=self.steps[piece],
+            ways=self.ways[piece],
+            fixes=self.fixes[piece],
+            headings=self.headings[piece],
+        )
+
     def thinned(self, stride: int) -> Nodes:
         """Every ``stride``-th node, with the steps between them."""
         if stride <= 1:
@@ -253,23 +265,59 @@ class Fusion:
     def filtered(self) -> Estimate:
         """Each pose from what was measured until then."""
         kept = self._run(self.nodes, self._noise)
-        return self._estimate(kept)
+        return self._estimate(self.nodes.stamps, kept)
 
-    def smoothed(self, scans: FloatArray | None = None) -> Estimate:
-        """Each pose from all that was measured, and what ``scans`` (N, 12) say (see :func:`replay.kalman.run`)."""
-        kept = self._run(self.nodes, self._noise, scans)
+    @property
+    def start(self) -> tuple[FloatArray, FloatArray]:
+        """Where the robot begins, as far as is known before anything is measured: pose (3,), covariance (6,)."""
+        return self._start.copy(), self._spread.copy()
+
+    def advance(
+        self, begin: int, end: int, state: FloatArray, spread: FloatArray, worse: float
+    ) -> tuple[FloatArray, FloatArray]:
+        """The filter over the nodes from ``begin`` to ``end``: pose and covariance (6,) at the last one.
+
+        ``state`` and ``spread`` are those before the first.
+
+        The odometry's variances are taken to be ``worse`` times what they are thought to be.
+        """
+        part = self.nodes.part(begin, end)
+        kept = self._run(part, self._worse(worse), start=(state, spread))
+        return kept.states[-1].copy(), kept.covs[-1].copy()
+
+    def _worse(self, times: float) -> FloatArray:
+        """The noise, with odometry whose variances are so many times as large."""
+        noise = self._noise.copy()
+        noise[[METRES, RADIANS]] *= math.sqrt(times)
+        return noise
+
+    def smoothed(self, scans: FloatArray | None = None, worse: float = 1.0, nodes: int | None = None) -> Estimate:
+        """Each pose from all that was measured, and what ``scans`` (N, 12) say (see :func:`replay.kalman.run`).
+
+        The odometry's variances are taken to be ``worse`` times what they are thought to be. With ``nodes``, only
+        the first so many poses, from what was measured until the last of them.
+        """
+        part = self.nodes.part(0, nodes)
+        kept = self._run(part, self._worse(worse), None if scans is None else scans[:nodes])
         gains = np.zeros((len(kept.states), 3, 3))
         smooth(kept.states, kept.covs, kept.predicted, kept.predicted_covs, gains)
-        return self._estimate(kept, gains)
+        return self._estimate(part.stamps, kept, gains)
 
-    def _estimate(self, kept: Filtered, gains: FloatArray | None = None) -> Estimate:
+    def _estimate(self, stamps: Stamps, kept: Filtered, gains: FloatArray | None = None) -> Estimate:
         poses = kept.states.copy()
         poses[:, 2] = wrap_angles(poses[:, 2])
         covariances = kept.covs[:, [0, 1, 2, 1, 3, 4, 2, 4, 5]].reshape(-1, 3, 3)
-        return Estimate(self.nodes.stamps, poses, covariances, self.noise, kept.verdicts, gains)
+        return Estimate(stamps, poses, covariances, self.noise, kept.verdicts, gains)
 
-    def _run(self, nodes: Nodes, noise: FloatArray, scans: FloatArray | None = None) -> Filtered:
+    def _run(
+        self,
+        nodes: Nodes,
+        noise: FloatArray,
+        scans: FloatArray | None = None,
+        start: tuple[FloatArray, FloatArray] | None = None,
+    ) -> Filtered:
         n = len(nodes.stamps)
+        state, spread = start or (self._start, self._spread)
         kept = Filtered(
             np.empty((n, 3)),
             np.empty((n, 6)),
@@ -279,8 +327,8 @@ class Fusion:
             np.empty((n, 2), np.int64),
         )
         run(
-            self._start,
-            self._spread,
+            state,
+            spread,
             nodes.steps,
             nodes.ways,
             nodes.fixes,

@@ -86,7 +86,7 @@ def moved(state: Any, cov: Any, step: Any, place: float, turn: float) -> None:
 @inline
 def learn_from_scan(state: Any, cov: Any, slope: Any, information: Any, looked_from: Any, work: Any) -> None:
     """What a scan says: its log-likelihood near the pose ``looked_from`` is slope . d - d' information d / 2."""
-    dx, dy, dt = state[0] - looked_from[0], state[1] - looked_from[1], state[2] - looked_from[2]
+    dx, dy, dt = state[0] - looked_from[0], state[1] - looked_from[1], wrapped(state[2] - looked_from[2])
     i = information
     gx = slope[0] - i[0] * dx - i[1] * dy - i[2] * dt
     gy = slope[1] - i[1] * dx - i[3] * dy - i[4] * dt
@@ -161,10 +161,10 @@ def run(
 ) -> None:
     """The filter over N nodes, from a pose ``start`` (3,) with covariance ``spread`` (6,).
 
-    ``steps`` (N, 3): how the robot moved since the node before, in its own frame there; ``ways`` (N,): how far that
-    was; ``fixes`` (N, 2) and ``headings`` (N,): NaN where there is none; ``lever`` (2,): where the antenna stands on
-    the robot; ``noise`` (5,); ``scans`` (N or 0, 12): what a scan says at each node (zeros: nothing): slope (3),
-    information (6), and the pose (3) that it was looked from.
+    ``steps`` (N, 3): how the robot moved since the node before (or the start), in its own frame there; ``ways`` (N,):
+    how far that was; ``fixes`` (N, 2) and ``headings`` (N,): NaN where there is none; ``lever`` (2,): where the
+    antenna stands on the robot; ``noise`` (5,); ``scans`` (N or 0, 12): what a scan says at each node (zeros:
+    nothing): slope (3), information (6), and the pose (3) that it was looked from.
 
     Fills ``states``, ``predicted`` (N, 3) and ``covs``, ``predicted_covs`` (N, 6): after and before the node's
     measurements; ``costs`` (N,): minus twice the log-likelihood of the node's fix and heading; ``verdicts`` (N, 2):
@@ -176,8 +176,7 @@ def run(
     for k in range(len(steps)):
         place = ways[k] * noise[METRES] ** 2 + LEAST_VARIANCE
         turn = ways[k] * noise[RADIANS] ** 2 + LEAST_VARIANCE
-        if k:
-            moved(state, cov, steps[k], place, turn)
+        moved(state, cov, steps[k], place, turn)
         predicted[k], predicted_covs[k] = state, cov
         costs[k] = 0.0
         verdicts[k] = 0

@@ -48,8 +48,9 @@ class LaserPoses:
     of the poses; ``ends`` (N, 3) are the poses at each scan's last beam, where that is not taken with the first.
     ``upside_down`` lasers turn the other way. ``source`` is one of SOURCES or STILL, ``origin``
     says it in full, ``notes`` what was assumed. Fused poses have ``covariances`` (N, 3, 3), a ``frame_covariance``
-    (3, 3) of the map's own place (see :meth:`replay.fusion.Estimate.frame_covariance`), and ``sensors`` that say how
-    noisy each was found to be.
+    (3, 3) of the map's own place (see :meth:`replay.fusion.Estimate.frame_covariance`), ``sensors`` that say how
+    noisy each was found to be, and the ``fusion`` itself, of a robot with the laser mounted at ``mounts`` (N, 3).
+    Where scans were ``matched`` with the map, the poses are corrected by that.
     """
 
     source: str
@@ -62,6 +63,9 @@ class LaserPoses:
     covariances: FloatArray | None = None
     frame_covariance: FloatArray | None = None
     sensors: tuple[Sensor, ...] = ()
+    fusion: Fusion | None = None
+    mounts: FloatArray | None = None
+    matched: bool = False
 
     def at(self, position: int) -> Pose2D:
         """A scan's pose, with its covariance where that is known."""
@@ -220,7 +224,7 @@ class Localizer:
         at, valid = odometry.trajectory.at(scans.wanted)
         mounts, upside_down, notes = self._mount(scans, odometry.base or BASE_FRAME)
         notes += _gap_note(topic.name, odometry.trajectory.stamps, scans.stamps) + odometry.notes
-        return LaserPoses(source, topic.name, _compose(at, mounts), valid, upside_down, notes)
+        return LaserPoses(source, topic.name, compose(at, mounts), valid, upside_down, notes)
 
     def _can_fuse(self) -> bool:
         """Whether the log has a GPS or compass to fuse with, as far as ``auto`` is concerned."""
@@ -262,13 +266,15 @@ class Localizer:
         return LaserPoses(
             FUSED,
             sensed.topics,
-            _compose(estimate.poses[at], mounts),
+            compose(estimate.poses[at], mounts),
             valid,
             upside_down,
             notes + sensed.notes + _fusion_notes(sensors),
-            covariances=_carried(estimate.covariances[at], estimate.poses[at], mounts),
+            covariances=carried(estimate.covariances[at], estimate.poses[at], mounts),
             frame_covariance=estimate.frame_covariance(scans.stamps),
             sensors=sensors,
+            fusion=fusion,
+            mounts=mounts,
         )
 
     def _nodes(self, scans: ScanTimes, base: str, sensed: Sensed) -> Nodes:
@@ -379,10 +385,12 @@ def _with_ends(found: LaserPoses, scans: int) -> LaserPoses:
     valid, known = found.valid[:scans], found.valid[scans:, None]
     poses, ends = found.poses[:scans], found.poses[scans:]
     covariances = None if found.covariances is None else found.covariances[:scans]
-    return replace(found, poses=poses, valid=valid, ends=np.where(known, ends, poses), covariances=covariances)
+    mounts = None if found.mounts is None else found.mounts[:scans]
+    ends = np.where(known, ends, poses)
+    return replace(found, poses=poses, valid=valid, ends=ends, covariances=covariances, mounts=mounts)
 
 
-def _compose(poses: FloatArray, mounts: FloatArray) -> FloatArray:
+def compose(poses: FloatArray, mounts: FloatArray) -> FloatArray:
     """Poses (N, 3) of frames that are mounted at ``mounts`` (N, 3) on frames at ``poses`` (N, 3)."""
     cos, sin = np.cos(poses[:, 2]), np.sin(poses[:, 2])
     x = poses[:, 0] + cos * mounts[:, 0] - sin * mounts[:, 1]
@@ -390,14 +398,14 @@ def _compose(poses: FloatArray, mounts: FloatArray) -> FloatArray:
     return np.column_stack((x, y, poses[:, 2] + mounts[:, 2]))
 
 
-def _carried(covariances: FloatArray, poses: FloatArray, mounts: FloatArray) -> FloatArray:
+def carried(covariances: FloatArray, poses: FloatArray, mounts: FloatArray) -> FloatArray:
     """Covariances (N, 3, 3) of frames that are mounted at ``mounts`` (N, 3) on frames at ``poses`` (N, 3)."""
     cos, sin = np.cos(poses[:, 2]), np.sin(poses[:, 2])
     turn = np.broadcast_to(np.eye(3), (len(poses), 3, 3)).copy()
     turn[:, 0, 2] = -(sin * mounts[:, 0] + cos * mounts[:, 1])
     turn[:, 1, 2] = cos * mounts[:, 0] - sin * mounts[:, 1]
-    carried: FloatArray = turn @ covariances @ turn.transpose(0, 2, 1)
-    return carried
+    moved: FloatArray = turn @ covariances @ turn.transpose(0, 2, 1)
+    return moved
 
 
 def _sensors(sensed: Sensed, estimate: Estimate) -> Iterator[Sensor]:

@@ -6,6 +6,7 @@ import time
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -23,6 +24,7 @@ from prim.metrics import MapScores, pose_nees, pose_rmse
 from prim.raycast import FloatArray
 from prim.shapes import angle_difference
 from prim.world import Bounds, World
+from replay.fusion import PoseNoise
 from replay.localize import FUSED, STILL, FuseOptions, LaserPoses, Localizer
 from replay.lookout import Lookout, Sighting, shipped_weights
 from replay.scans import PosedScan, ScanLog, Selection, counted, pieces_of, turned_over
@@ -65,6 +67,7 @@ class ReplayOptions:
     standing_still: bool = False
     fuse: FuseOptions = field(default_factory=FuseOptions)
     deskew: bool = True
+    match_scans: bool = False
     selection: Selection = field(default_factory=Selection)
     rate: float | None = None
     map_every: int | None = None
@@ -90,10 +93,18 @@ class ReplayOptions:
             raise UsageError(f"--detect-every is {self.detect_every}: it must be at least 1")
         if not self.detect and (self.detect_every or self.weights or not self.refine):
             raise UsageError("--no-detect excludes --detect-every, --weights and --no-refine")
+        self._check_poses()
+
+    def _check_poses(self) -> None:
         if self.standing_still and (self.pose != "auto" or self.odom_topic):
             raise UsageError("--standing-still excludes --pose and --odom-topic")
-        if self.fuse != FuseOptions() and self.pose not in ("auto", FUSED):
-            raise UsageError(f"--fuse, topics of GPS and compass and their noise do not go with --pose {self.pose}")
+        if self.standing_still and self.match_scans:
+            raise UsageError("--standing-still excludes --match-scans: there is no motion to correct")
+        fuses = self.pose in ("auto", FUSED)
+        if not fuses and replace(self.fuse, noise=PoseNoise()) != FuseOptions():
+            raise UsageError(f"--fuse, --gps-topic and --compass-topic do not go with --pose {self.pose}")
+        if not fuses and not self.match_scans and self.fuse.noise != PoseNoise():
+            raise UsageError("--pose-noise and --odom-noise go with --pose fused or with --match-scans")
         if self.odom_topic and self.pose not in ("auto", "odom", FUSED):
             raise UsageError(f"--odom-topic goes with --pose odom, not with --pose {self.pose}")
         offset = self.laser_offset
@@ -200,6 +211,8 @@ class Pipeline:
                 truth = self._read_truth(log)
             with self._clock.stage("localize"):
                 poses, true_poses = self._localize(log, scans)
+                if self.options.match_scans:
+                    poses = self._matched(scans, poses)
             frame = self._frame(scans, poses, truth)
             judge = Judge(frame, truth, poses, true_poses)
             lookout = self._lookout(frame, truth if judge.scores_maps else None, poses.frame_covariance)
@@ -254,6 +267,8 @@ class Pipeline:
         if options.standing_still:
             return localizer.stand_still(times), None
         poses = localizer.locate(times, options.pose)
+        if options.fuse != FuseOptions() and poses.source != FUSED and not options.match_scans:
+            self._notes.append(f"nothing is fused, since there are poses on {poses.origin}: give --pose fused")
         if poses.source == "truth":
             return poses, poses
         if not localizer.has_truth:
@@ -263,6 +278,14 @@ class Pipeline:
         except LogReadError as error:
             self._notes.append(f"the poses are not held against the truth: {error.what}")
             return poses, None
+
+    def _matched(self, scans: ScanLog, poses: LaserPoses) -> LaserPoses:
+        """The poses corrected by a map that is made of the scans."""
+        from replay.matching import match  # when it is needed: a replay without it starts faster
+
+        options = self.options
+        posed = partial(self._posed, scans)
+        return match(poses, scans.stamps, posed, options.resolution, options.noise_std, options.fuse.noise)
 
     def _frame(self, scans: ScanLog, poses: LaserPoses, truth: Truth | None) -> GridFrame:
         """The map's frame: the bounds given, else the recorded world's and a margin, else the end points'."""

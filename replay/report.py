@@ -80,6 +80,7 @@ def _pose_spread(result: ReplayResult) -> dict[str, Any]:
         "std_m": std and std[0],
         "std_rad": std and std[1],
         "nees": result.pose_nees,
+        "matched": result.poses.matched,
         "sensors": {
             sensor.name: {
                 "topic": sensor.topic,
@@ -218,7 +219,7 @@ def table(result: ReplayResult) -> list[tuple[str, str]]:
     used = f"{result.scans_used} of {result.scans}" if result.scans_used != result.scans else f"{result.scans}"
     rows = [
         ("log", f"{result.path.name}, {result.duration:.1f} s, {used} scans, {result.rays:,} rays"),
-        ("poses", f"{result.poses.source} ({result.poses.origin})"),
+        ("poses", f"{result.poses.source} ({result.poses.origin}){', matched scans' * result.poses.matched}"),
         ("map", f"{result.options.mapper}, {frame.cols} x {frame.rows} cells of {frame.resolution:g} m"),
         ("bounds", f"x {x0:.2f} to {x1:.2f} m, y {y0:.2f} to {y1:.2f} m"),
     ]

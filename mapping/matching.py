@@ -1,0 +1,114 @@
+"""How well a scan fits a map from a pose, and where it would fit better: the forward sensor model as a likelihood."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mapping.forward import Fit
+from mapping.grid import GridFrame
+from mapping.level import FARTHEST, Level, Noise
+from mapping.likelihood import look, tables
+from prim.frames import Pose2D, Scan
+from prim.raycast import FloatArray
+
+NUDGE_CELLS, NUDGE_SPREAD = 0.5, 0.2
+"""Derivatives are taken by differences over this many cells, or over this share of the noise where that is larger."""
+
+NUDGE_REACH = 1.0
+"""A turn moves what is this far off (m) as far as the differences of place do."""
+
+_TABLE = tables()
+
+
+@dataclass(frozen=True)
+class Beams:
+    """A scan's measurements in the frame of its laser.
+
+    ``rays`` (N, 5) are as :func:`mapping.likelihood.look` takes them, ``limits`` range_min and range_max (m).
+    """
+
+    rays: FloatArray
+    limits: tuple[float, float]
+
+    @classmethod
+    def of(cls, pieces: Sequence[tuple[Scan, Pose2D]], pose: Pose2D, most: int, offset: int = 0) -> Beams:
+        """At most ``most`` measurements of a scan, evenly spread from the ``offset``-th on, as seen from ``pose``.
+
+        ``pieces`` are parts of the scan with the pose that each was taken from. What counts as a measurement is as in
+        :meth:`mapping.level.Rays.add`.
+        """
+        first = pieces[0][0]
+        back = pose.inverse()
+        parts = []
+        for scan, taken_from in pieces:
+            seen_from = back @ Pose2D(taken_from.x, taken_from.y, taken_from.theta)
+            z = scan.ranges
+            with np.errstate(invalid="ignore"):
+                used = ((z >= scan.range_min) & (z > 0)) | (np.isneginf(z) & (scan.range_min > 0))
+            rays = np.empty((int(np.count_nonzero(used)), 5))
+            rays[:, :2] = seen_from.x, seen_from.y
+            rays[:, 2:4] = Pose2D(0, 0, seen_from.theta).apply(scan.directions[used])
+            rays[:, 4] = np.where(z[used] >= scan.range_max, np.inf, z[used])
+            parts.append(rays)
+        every = np.concatenate(parts)
+        stride = max(1, -(-len(every) // most))
+        limits = max(first.range_min, 0.0), min(first.range_max, FARTHEST)
+        return cls(np.ascontiguousarray(every[offset % stride :: stride]), limits)
+
+
+@dataclass(frozen=True)
+class Look:
+    """A scan's log-likelihood from a pose, its slope (3,) and the information (3, 3) that it holds about the pose."""
+
+    log_likelihood: float
+    slope: FloatArray
+    information: FloatArray
+    rays: int
+
+
+@dataclass(frozen=True)
+class Likelihood:
+    """A map of stopping chances that scans can be held against."""
+
+    frame: GridFrame
+    stopping: NDArray[np.float32]
+    noise: Noise
+
+    @classmethod
+    def of(cls, level: Level | Fit, noise: Noise) -> Likelihood:
+        """The likelihood under a level's map, or a fit's."""
+        return cls(level.frame, level.stopping, noise)
+
+    def look(self, beams: Beams, pose: FloatArray, mount: FloatArray, widened: float = 1.0) -> Look:
+        """A scan from a robot at ``pose`` (3,) whose laser is mounted at ``mount`` (3,); noise ``widened`` times."""
+        std = self.noise.std * widened
+        step = max(NUDGE_CELLS * self.frame.resolution, NUDGE_SPREAD * std)
+        return self._look(beams, pose, mount, std, np.array([step, step, step / NUDGE_REACH]))
+
+    def of_scan(self, beams: Beams, pose: FloatArray, mount: FloatArray, widened: float = 1.0) -> float:
+        """The log-likelihood alone."""
+        return self._look(beams, pose, mount, self.noise.std * widened, np.zeros(3)).log_likelihood
+
+    def _look(self, beams: Beams, pose: FloatArray, mount: FloatArray, std: float, nudges: FloatArray) -> Look:
+        found = np.empty(11)
+        look(
+            beams.rays,
+            pose,
+            mount,
+            beams.limits,
+            nudges,
+            np.array(self.frame.origin),
+            self.frame.resolution,
+            self.stopping,
+            std,
+            self.noise.wild,
+            _TABLE,
+            found,
+        )
+        slope, rays = found[1:4], int(found[10])
+        information = found[[4, 5, 6, 5, 7, 8, 6, 8, 9]].reshape(3, 3) - np.outer(slope, slope) / max(rays, 1)
+        return Look(float(found[0]), slope, information, rays)
