@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from prim.frames import Stamps, Trajectory, wrap_angle, wrap_angles
 from prim.raycast import FloatArray
-from replay.kalman import BIAS, FIX_STD, HEADING_STD, METRES, RADIANS, REJECTED, USED, common, run, smooth
+from replay.kalman import BIAS, FIX_STD, GATES, HEADING_STD, METRES, RADIANS, REJECTED, USED, common, run, smooth
 
 LEVER = 0.03
 """A turn by one radian wears on the odometry as so many metres of way."""
@@ -45,6 +45,9 @@ MOST_NODES = 20_000
 
 BIAS_SCORE = 12.0
 """A compass is taken to be biased where the likelihood says so: one in 2000 that are not (chi squared)."""
+
+NO_GATES = np.full(2, np.inf)
+"""Without odometry nothing tells a turn from a heading that is wrong."""
 
 LEAST_STD, MOST_STD = 1e-5, 1e3
 
@@ -335,6 +338,7 @@ class Fusion:
             nodes.headings,
             nodes.lever,
             noise,
+            GATES if nodes.moves else NO_GATES,
             np.zeros((0, 12)) if scans is None else scans,
             kept.states,
             kept.covs,
@@ -392,12 +396,16 @@ class Fusion:
         return math.atan2(across, float((gone * fixes).sum()))
 
     def _unknown(self) -> list[int]:
-        """Which parts of the noise are to be found, the bias apart."""
+        """Which parts of the noise are to be found, the bias apart.
+
+        Without odometry the motion is anything but a random walk of normal steps, and the sensors' noise stays what
+        differences between neighbouring readings show.
+        """
         given, nodes = self._given, self.nodes
         found = []
-        if given.fixes is None and nodes.has_fixes.any():
+        if given.fixes is None and nodes.has_fixes.any() and nodes.moves:
             found.append(FIX_STD)
-        if given.headings is None and nodes.has_headings.any():
+        if given.headings is None and nodes.has_headings.any() and nodes.moves:
             found.append(HEADING_STD)
         if nodes.has_fixes.any() and given.metres is None:
             found.append(METRES)

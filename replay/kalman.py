@@ -18,7 +18,7 @@ import numpy as np
 
 from mapping.rays import inline, kernel
 
-FIX_GATE, HEADING_GATE = 13.8, 10.8
+GATES = np.array([13.8, 10.8])
 """A fix or heading whose squared normalised innovation is larger is not used: 1 in 1000 (chi squared, 2 and 1)."""
 
 PATIENCE = 20
@@ -101,7 +101,9 @@ def learn_from_scan(state: Any, cov: Any, slope: Any, information: Any, looked_f
 
 
 @inline
-def take_fix(state: Any, cov: Any, x: float, y: float, lever: Any, variance: float, missed: int) -> tuple[float, int]:
+def take_fix(
+    state: Any, cov: Any, x: float, y: float, lever: Any, variance: float, gate: float, missed: int
+) -> tuple[float, int]:
     """A position fix of an antenna that stands at ``lever`` on the robot: its cost, and how many in a row are missed.
 
     The cost is minus twice the log-likelihood, but for a constant; that of one which is not used ends at the gate.
@@ -115,30 +117,32 @@ def take_fix(state: Any, cov: Any, x: float, y: float, lever: Any, variance: flo
     determinant = xx * yy - xy * xy
     squared = (yy * nx * nx - 2 * xy * nx * ny + xx * ny * ny) / determinant
     size = math.log(determinant)
-    if squared > FIX_GATE:
+    if squared > gate:
         if missed < PATIENCE:
-            return FIX_GATE + size, missed + 1
+            return gate + size, missed + 1
         cov[0] += nx * nx
         cov[3] += ny * ny
     corrected(state, cov, 1.0, 0.0, -ly, variance, nx)
     ny = y - state[1] - (math.sin(state[2]) * lever[0] + math.cos(state[2]) * lever[1])
     corrected(state, cov, 0.0, 1.0, lx, variance, ny)
-    return min(squared, FIX_GATE) + size, 0
+    return min(squared, gate) + size, 0
 
 
 @inline
-def take_heading(state: Any, cov: Any, heading: float, variance: float, missed: int) -> tuple[float, int]:
+def take_heading(
+    state: Any, cov: Any, heading: float, variance: float, gate: float, missed: int
+) -> tuple[float, int]:
     """A heading: its cost, and how many in a row are missed (as take_fix)."""
     off = wrapped(heading - state[2])
     spread = cov[5] + variance
     squared = off * off / spread
     size = math.log(spread)
-    if squared > HEADING_GATE:
+    if squared > gate:
         if missed < PATIENCE:
-            return HEADING_GATE + size, missed + 1
+            return gate + size, missed + 1
         cov[5] += off * off
     corrected(state, cov, 0.0, 0.0, 1.0, variance, off)
-    return min(squared, HEADING_GATE) + size, 0
+    return min(squared, gate) + size, 0
 
 
 @kernel
@@ -151,6 +155,7 @@ def run(
     headings: Any,
     lever: Any,
     noise: Any,
+    gates: Any,
     scans: Any,
     states: Any,
     covs: Any,
@@ -163,8 +168,9 @@ def run(
 
     ``steps`` (N, 3): how the robot moved since the node before (or the start), in its own frame there; ``ways`` (N,):
     how far that was; ``fixes`` (N, 2) and ``headings`` (N,): NaN where there is none; ``lever`` (2,): where the
-    antenna stands on the robot; ``noise`` (5,); ``scans`` (N or 0, 12): what a scan says at each node (zeros:
-    nothing): slope (3), information (6), and the pose (3) that it was looked from.
+    antenna stands on the robot; ``noise`` (5,); ``gates`` (2,): a fix or heading with a larger squared normalised
+    innovation is not used; ``scans`` (N or 0, 12): what a scan says at each node (zeros: nothing): slope (3),
+    information (6), and the pose (3) that it was looked from.
 
     Fills ``states``, ``predicted`` (N, 3) and ``covs``, ``predicted_covs`` (N, 6): after and before the node's
     measurements; ``costs`` (N,): minus twice the log-likelihood of the node's fix and heading; ``verdicts`` (N, 2):
@@ -181,12 +187,14 @@ def run(
         costs[k] = 0.0
         verdicts[k] = 0
         if not math.isnan(fixes[k, 0]):
-            cost, missed = take_fix(state, cov, fixes[k, 0], fixes[k, 1], lever, fix_variance, lost_fixes)
+            cost, missed = take_fix(state, cov, fixes[k, 0], fixes[k, 1], lever, fix_variance, gates[0], lost_fixes)
             costs[k] += cost
             verdicts[k, 0] = REJECTED if missed else USED
             lost_fixes = missed
         if not math.isnan(headings[k]):
-            cost, missed = take_heading(state, cov, headings[k] - noise[BIAS], heading_variance, lost_headings)
+            cost, missed = take_heading(
+                state, cov, headings[k] - noise[BIAS], heading_variance, gates[1], lost_headings
+            )
             costs[k] += cost
             verdicts[k, 1] = REJECTED if missed else USED
             lost_headings = missed

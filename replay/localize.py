@@ -145,6 +145,22 @@ class Localizer:
             self._tree_notes = (f"tf is not used: {error.what}",)
             return TransformTree()
 
+    @cached_property
+    def _static_tree(self) -> TransformTree:
+        """The transforms that stay, which are read in no time; those alone, unless they are not enough."""
+        try:
+            return TransformTree.read(self._log, static_only=True)
+        except LogReadError:
+            return TransformTree()
+
+    def _chain_to(self, base: str, frame: str) -> tuple[TransformTree, list[str]]:
+        """The frames from ``frame`` up to ``base``, and the tree that has them; the frame alone where none does."""
+        for tree in (self._static_tree, self._tree):
+            chain = tree.chain(frame)
+            if base in chain:
+                return tree, chain[: chain.index(base) + 1]
+        return self._tree, chain[:1]
+
     def locate(self, scans: ScanTimes, source: str = "auto") -> LaserPoses:
         """The laser's pose at every scan, from ``source`` or, with ``auto``, from the best there is.
 
@@ -295,11 +311,10 @@ class Localizer:
 
     def _fixed_mount(self, frame: str, base: str) -> Pose2D:
         """Where a sensor's frame stands on the robot by static transforms; the base itself where there are none."""
-        chain = self._tree.chain(frame)
-        if base not in chain[1:]:
+        tree, chain = self._chain_to(base, frame)
+        if len(chain) < 2:
             return Pose2D()
-        chain = chain[: chain.index(base) + 1]
-        rotation, translation, _ = self._tree.lookup(chain, np.zeros(1, dtype=np.int64))
+        rotation, translation, _ = tree.lookup(chain, np.zeros(1, dtype=np.int64))
         return Pose2D(*flatten(rotation, translation)[0][0].tolist())
 
     def stand_still(self, scans: ScanTimes) -> LaserPoses:
@@ -311,9 +326,8 @@ class Localizer:
     def _mount(self, scans: ScanTimes, base: str) -> tuple[FloatArray, bool, tuple[str, ...]]:
         """Where the laser stands on the robot at every scan, whether upside down, and what had to be assumed."""
         frame = scans.frame_id.lstrip("/")
-        chain = self._tree.chain(frame)
-        chain = chain[: chain.index(base) + 1] if base in chain else chain[:1]
-        rotation, translation, _ = self._tree.lookup(chain, scans.wanted)
+        tree, chain = self._chain_to(base, frame)
+        rotation, translation, _ = tree.lookup(chain, scans.wanted)
         mounts, upside_down, notes = flatten(rotation, translation)
         notes += self._tree_notes
         if self._offset is not None:

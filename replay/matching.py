@@ -2,7 +2,7 @@
 
 Poses that drift are first corrected scan by scan, as the map grows: a few Gauss-Newton steps each, from where the
 odometry says. Then in rounds: a map of all scans, what each of them says about its pose in it, and a smoother over
-all poses, odometry, fixes and headings. What a scan says is the likelihood of its rays under the forward sensor model.
+all poses, odometry, fixes and headings. What a scan says is its rays' likelihood under the forward sensor model.
 """
 
 from __future__ import annotations

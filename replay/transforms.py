@@ -19,6 +19,9 @@ from replay.sensors import is_usable
 ROOTS = (MAP_FRAME, ODOM_FRAME)
 """Frames that stand still, the best first."""
 
+STATIC = "tf_static"
+"""Topics whose names end so hold transforms that stay."""
+
 MAX_TILT = 0.97
 """Below this cosine a laser's plane counts as tilted, and its scans as no horizontal section (14 degrees)."""
 
@@ -55,16 +58,18 @@ class TransformTree:
     disputed: list[tuple[str, str]] = field(default_factory=list)
 
     @classmethod
-    def read(cls, log: LogReader) -> TransformTree:
-        """Reads all topics of tf messages. Raises LogReadError."""
+    def read(cls, log: LogReader, static_only: bool = False) -> TransformTree:
+        """Reads all topics of tf messages, or those of static ones alone. Raises LogReadError."""
         found: dict[tuple[str, str], list[StampedPose]] = defaultdict(list)
         static: set[tuple[str, str]] = set()
         for topic in log.of_type(TF_TYPE):
+            if static_only and not topic.name.endswith(STATIC):
+                continue
             for _, poses in log.decoded(topic, partial(decode_poses, TF_TYPE)):
                 for pose in poses:
                     edge = pose.frame_id.lstrip("/"), pose.child_frame_id.lstrip("/")
                     found[edge].append(pose)
-                    if topic.name.endswith("tf_static"):
+                    if topic.name.endswith(STATIC):
                         static.add(edge)
         tree = cls()
         usable = {edge: kept for edge, poses in found.items() if (kept := [p for p in poses if is_usable(p)])}
