@@ -21,6 +21,15 @@ NUDGE_CELLS, NUDGE_SPREAD = 0.5, 0.2
 NUDGE_REACH = 1.0
 """A turn moves what is this far off (m) as far as the differences of place do."""
 
+STEPS = 4
+"""Gauss-Newton steps to a better pose at most."""
+
+LONGEST = 8
+"""A step is made so many times as long at most, where it goes on uphill."""
+
+STILL_METRES, STILL_RADIANS = 2e-4, 1e-4
+"""A step that is shorter is none."""
+
 _TABLE = tables()
 
 
@@ -112,3 +121,47 @@ class Likelihood:
         slope, rays = found[1:4], int(found[10])
         information = found[[4, 5, 6, 5, 7, 8, 6, 8, 9]].reshape(3, 3) - np.outer(slope, slope) / max(rays, 1)
         return Look(float(found[0]), slope, information, rays)
+
+
+def climb(
+    likelihood: Likelihood,
+    beams: Beams,
+    mount: FloatArray,
+    pose: FloatArray,
+    prior: FloatArray,
+    believed: FloatArray,
+    widened: float = 1.0,
+) -> tuple[FloatArray, Look]:
+    """A likelier pose (3,) by a few Gauss-Newton steps from ``pose`` on, and what the scan says there.
+
+    ``prior`` is what is believed beforehand, with information ``believed`` (3, 3). Far off, single rays' slopes
+    promise more information than there is: a step that goes on uphill is made longer, one that overshoots shorter.
+    """
+
+    def worth(at: FloatArray, log_likelihood: float) -> float:
+        return float(log_likelihood - (at - prior) @ believed @ (at - prior) / 2)
+
+    def along(step: FloatArray) -> float:
+        return worth(pose + step, likelihood.of_scan(beams, pose + step, mount, widened))
+
+    look = likelihood.look(beams, pose, mount, widened)
+    for _ in range(STEPS):
+        height = worth(pose, look.log_likelihood)
+        slope = look.slope - believed @ (pose - prior)
+        step: FloatArray = np.linalg.solve(look.information + believed, slope).astype(float)
+        reached, length = along(step), 1
+        while reached > height and length < LONGEST and (further := along(2 * step)) > reached:
+            step, reached, length = 2 * step, further, 2 * length
+        while reached <= height and not is_still(step):
+            step = step / 2
+            reached = along(step)
+        if reached <= height or is_still(step):
+            break
+        pose = pose + step
+        look = likelihood.look(beams, pose, mount, widened)
+    return pose, look
+
+
+def is_still(step: FloatArray) -> bool:
+    """Whether a step (3,) is too short to count."""
+    return bool(np.abs(step[:2]).max() < STILL_METRES and abs(step[2]) < STILL_RADIANS)

@@ -14,7 +14,7 @@ from dataclasses import replace
 import numpy as np
 
 from mapping.forward import ForwardMapper
-from mapping.matching import Beams, Likelihood, Look
+from mapping.matching import Beams, Likelihood, climb
 from prim.frames import Pose2D, Scan, Stamps, Trajectory, wrap_angles
 from prim.raycast import FloatArray
 from replay.fusion import Fusion, PoseNoise, nodes_at, six_of, steps_between
@@ -34,14 +34,8 @@ ROUNDS = 12
 TRUST = np.diag([0.1**-2, 0.1**-2, math.radians(2) ** -2])
 """How far a scan may lead its pose in a round: what is believed of it, in place of what other sensors say."""
 
-STEPS = 4
-"""Gauss-Newton steps for each scan at most, at each widening of the noise."""
-
 MOST_WIDENED, SURE = 8.0, 2.5
 """The noise is widened so that the pose is within it at first: SURE standard deviations of the pose, and no more."""
-
-STILL_METRES, STILL_RADIANS = 2e-4, 1e-4
-"""A pose has settled when a step moves it less."""
 
 FIRST_ROUND = 4
 """All scans so far are matched anew when they are so many, and each time that they have doubled."""
@@ -207,7 +201,7 @@ class Matcher:
         pose = prior.copy()
         widened = widening(SURE * math.sqrt(spread[0] + spread[3] + spread[5]), likelihood)
         while True:
-            pose, look = self._climbed(likelihood, beams, mount, pose, prior, believed, widened)
+            pose, look = climb(likelihood, beams, mount, pose, prior, believed, widened)
             if widened <= 1:
                 break
             widened = max(widened / 2, 1.0)
@@ -219,34 +213,6 @@ class Matcher:
         self._worse = min(max(self._worse * surprise**ADAPTS, 1.0), MOST_WORSE)
         return pose, six_of(after[None])[0]
 
-    def _climbed(
-        self,
-        likelihood: Likelihood,
-        beams: Beams,
-        mount: FloatArray,
-        pose: FloatArray,
-        prior: FloatArray,
-        believed: FloatArray,
-        widened: float,
-    ) -> tuple[FloatArray, Look]:
-        """A few Gauss-Newton steps uphill, each halved where it overshoots."""
-        look = likelihood.look(beams, pose, mount, widened)
-        for _ in range(STEPS):
-            off = pose - prior
-            worth = look.log_likelihood - off @ believed @ off / 2
-            step = np.linalg.solve(look.information + believed, look.slope - believed @ off)
-            while np.abs(step[:2]).max() > STILL_METRES or abs(step[2]) > STILL_RADIANS:
-                tried = pose + step
-                off = tried - prior
-                if likelihood.of_scan(beams, tried, mount, widened) - off @ believed @ off / 2 > worth:
-                    break
-                step = step / 2
-            else:
-                break
-            pose = tried
-            look = likelihood.look(beams, pose, mount, widened)
-        return pose, look
-
     def _looks(self, likelihood: Likelihood, widened: float) -> tuple[float, FloatArray]:
         """Mean log-likelihood of a ray, and what each node's scans say about its pose (N, 12)."""
         rows = np.zeros((len(self._robot), 12))
@@ -256,7 +222,7 @@ class Matcher:
             beams, pose = self._beams[posed.position], self._robot[node]
             total += likelihood.of_scan(beams, pose, mount, widened)
             rays += len(beams.rays)
-            best, look = self._climbed(likelihood, beams, mount, pose, pose, TRUST, widened)
+            best, look = climb(likelihood, beams, mount, pose, pose, TRUST, widened)
             if look.rays >= LEAST_RAYS:
                 row = rows[node]
                 row[:3] += look.slope - square(row[3:9]) @ (
