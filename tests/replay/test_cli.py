@@ -13,7 +13,8 @@ import pytest
 
 from mapping.mapper import MAPPERS
 from prim import console
-from recorder.session import Session
+from recorder.sensors import Lidar
+from recorder.session import Session, SessionOptions, record
 from replay.cli import app, join_bounds
 from replay.lookout import shipped_weights
 
@@ -54,7 +55,8 @@ def test_a_plain_replay_leaves_a_recording_and_a_report(replay: Run, noisy_sessi
         "messages_lost": 0,
         "recovered": False,
     }
-    assert report["pose"] == {"source": "truth", "rmse_m": None, "rmse_rad": None}
+    unknown = dict.fromkeys(("rmse_m", "rmse_rad", "std_m", "std_rad", "nees", "sensors"))
+    assert report["pose"] == {"source": "truth", "matched": False, **unknown}
     assert report["map"]["mapper"] == mapper
     assert report["map"]["origin_m"] == pytest.approx([-1.1, -1.1])
     assert report["map"]["cells"] == [220, 220]
@@ -359,3 +361,86 @@ def test_a_missing_file_and_a_folder(replay: Run, tmp_path: Path) -> None:
     for path in ("none.mcap", tmp_path):
         code, _, err = replay(path)
         assert (code, err.count("\n")) == (1, 1)
+
+
+@pytest.fixture(scope="module")
+def driven_session(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A driven session: 15 s, 60 scans of 120 rays."""
+    path = tmp_path_factory.mktemp("driven") / "driven.mcap"
+    options = SessionOptions(seed=2, motion="drive", duration=15.0, rate=4.0, lidar=Lidar(rays=120))
+    return record(path, options).path
+
+
+@pytest.mark.parametrize("mapper", MAPPERS)
+def test_fused_poses_say_how_sure_they_are(replay: Run, driven_session: Path, mapper: str) -> None:
+    code, out, err = replay(driven_session, "--pose", "fused", "--mapper", mapper, "--trajectory", "fused.tum")
+    assert (code, err) == (0, "")
+    pose = report_of(f"driven.{mapper}.report.json")["pose"]
+    assert pose["source"] == "fused" and not pose["matched"]
+    assert pose["rmse_m"] < 0.08 and pose["rmse_m"] < 4 * pose["std_m"] and pose["nees"] < 12
+    assert pose["sensors"]["gps"]["std_m"] == pytest.approx(0.1, rel=0.3)
+    assert pose["sensors"]["compass"]["std_rad"] == pytest.approx(math.radians(3), rel=0.3)
+    assert pose["sensors"]["odom"]["topic"] == "/odom" and pose["sensors"]["gps"]["used"] >= 57
+    assert "fused (/odom, /gps, /compass)" in out and "pose noise" in out and "expected" in out
+    assert len(np.loadtxt("fused.tum")) == 60
+
+
+@pytest.mark.parametrize(("sensors", "topics"), [("gps,odom", "/odom, /gps"), ("gps, compass", "/gps, /compass")])
+def test_some_of_the_sensors(replay: Run, driven_session: Path, sensors: str, topics: str) -> None:
+    code, out, _ = replay(driven_session, "--pose", "fused", "--fuse", sensors, "--no-viewer", "--no-detect")
+    assert code == 0 and f"fused ({topics})" in out
+
+
+def test_noise_of_poses_is_what_is_given(replay: Run, driven_session: Path) -> None:
+    given = ["--pose-noise", 0.2, 5, "--odom-noise", 0.1, 4, "--gps-topic", "/gps", "--compass-topic", "/compass"]
+    assert replay(driven_session, "--pose", "fused", *given, "--no-viewer", "--no-detect")[0] == 0
+    sensors = report_of("driven.prob.report.json")["pose"]["sensors"]
+    assert sensors["gps"]["std_m"] == 0.2 and sensors["compass"]["std_rad"] == pytest.approx(math.radians(5))
+    assert sensors["odom"] | {"std_rad": 0} == {
+        "topic": "/odom", "used": 60, "rejected": 0, "std_m": 0.1, "std_rad": 0,
+    }  # fmt: skip
+
+
+@pytest.mark.parametrize("options", [[], ["--pose-noise", 0.1, 3]])
+def test_matched_scans_correct_odometry(replay: Run, driven_session: Path, options: list[object]) -> None:
+    plain = ["--no-viewer", "--no-detect", "--resolution", 0.02]
+    assert replay(driven_session, "--pose", "odom", *plain)[0] == 0
+    before = report_of("driven.prob.report.json")["pose"]
+    code, out, _ = replay(driven_session, "--pose", "odom", "--match-scans", *plain, *options)
+    after = report_of("driven.prob.report.json")["pose"]
+    assert code == 0 and "odom (/odom), matched scans" in out
+    assert after["matched"] and not before["matched"] and after["std_m"] > 0
+    if not options:  # what drifts is no noise: told so, they stay where they are on average
+        assert after["rmse_m"] < before["rmse_m"] / 2
+
+
+@pytest.mark.parametrize(
+    ("options", "what"),
+    [
+        (["--fuse", "sonar"], "sonar is no sensor; they are odom, gps, compass"),
+        (["--fuse", "odom,"], "an empty name is no sensor"),
+        (["--pose", "odom", "--fuse", "gps"], "do not go with --pose odom"),
+        (["--pose", "tf", "--gps-topic", "/gps"], "do not go with --pose tf"),
+        (["--pose", "odom", "--pose-noise", 0.1, 1], "go with --pose fused or with --match-scans"),
+        (["--pose-noise", 0, 1], "--pose-noise is 0 1: both must be above 0"),
+        (["--odom-noise", 0.1, "nan"], "--odom-noise is 0.1 nan: both must be above 0"),
+        (["--standing-still", "--match-scans"], "excludes --match-scans"),
+    ],
+)
+def test_options_of_poses_that_make_no_sense(
+    replay: Run, driven_session: Path, options: list[object], what: str
+) -> None:
+    code, _, err = replay(driven_session, *options)
+    assert code == 2 and what in err and len(err.splitlines()) == 1
+
+
+def test_what_is_not_fused_is_said(replay: Run, driven_session: Path) -> None:
+    _, _, err = replay(driven_session, "--fuse", "gps,compass", "--no-viewer", "--no-detect")
+    assert "nothing is fused, since there are poses on /ground_truth/pose: give --pose fused" in err
+
+
+def test_sensors_that_are_not_there(replay: Run, driven_session: Path) -> None:
+    code, _, err = replay(driven_session, "--pose", "fused", "--fuse", "gps")
+    assert code == 1 and "fused poses need odometry, or a GPS and a compass: there is /gps" in err
+    code, _, err = replay(driven_session, "--pose", "fused", "--gps-topic", "/odom")
+    assert code == 1 and "topics of that type: /gps" in err
