@@ -451,7 +451,7 @@ class Pipeline:
                 self.viewer.show_scan(position, stamp, posed.pose, posed.points, seconds)
                 error = judge.pose_error(position)
                 if error is not None:
-                    self.viewer.show_pose_error(position, stamp, *error)
+                    self.viewer.show_pose_error(position, stamp, *error, posed.pose)
             if map_every and position % map_every == 0:
                 with self._clock.stage("map"):
                     grid = mapper.grid()

@@ -82,7 +82,7 @@ class Viewer(Protocol):
     def show_map(self, position: int, stamp: int, grid: OccupancyGrid, scores: MapScores | None) -> None:
         """The map so far and its scores against the truth."""
 
-    def show_pose_error(self, position: int, stamp: int, metres: float, radians: float) -> None:
+    def show_pose_error(self, position: int, stamp: int, metres: float, radians: float, pose: Pose2D) -> None:
         """How far the pose in use is from the true one."""
 
     def show_sighting(self, position: int, stamp: int, sighting: Sighting) -> None:
@@ -115,7 +115,7 @@ class NullViewer:
     def show_map(self, position: int, stamp: int, grid: OccupancyGrid, scores: MapScores | None) -> None:
         """Nothing."""
 
-    def show_pose_error(self, position: int, stamp: int, metres: float, radians: float) -> None:
+    def show_pose_error(self, position: int, stamp: int, metres: float, radians: float, pose: Pose2D) -> None:
         """Nothing."""
 
     def show_sighting(self, position: int, stamp: int, sighting: Sighting) -> None:

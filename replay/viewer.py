@@ -99,6 +99,10 @@ LENGTHS = {
 }
 """Mean errors of what was found, over time; the angle's has a plot of its own scale."""
 
+POSE_LENGTHS = (("position, mm", (86, 180, 233)), ("1σ told, mm", (40, 90, 130)))
+POSE_TURNS = (("heading, degrees", (230, 159, 0)), ("1σ told, degrees", (130, 90, 0)))
+"""Errors of poses over time, each with the standard deviation that was told, where one was."""
+
 CROPS_IN_A_ROW = 6
 
 CHI_SQUARED = 5.991
@@ -125,7 +129,7 @@ class RerunViewer:
         self._recording.set_log_time_enabled(False)
         self._batch: list[_ScanEntry] = []
         self._batch_started = 0.0
-        self._pose_errors: list[tuple[int, int, float, float]] = []
+        self._pose_errors: list[tuple[tuple[int, int], tuple[float, float], tuple[float, float]]] = []
         self._trail: list[tuple[float, float]] = []
         self._size = 1.0
         self._styled: set[str] = set()
@@ -140,8 +144,8 @@ class RerunViewer:
         self._static("map", rr.ViewCoordinates.RIGHT_HAND_Z_UP)
         self._static("evidence", rr.ViewCoordinates.RIGHT_HAND_Z_UP)
         self._name_series("scores", SCORES.values())
-        self._name_series("pose_error/position", [("position, mm", (86, 180, 233))])
-        self._name_series("pose_error/heading", [("heading, degrees", (230, 159, 0))])
+        self._name_series("pose_error/position", POSE_LENGTHS)
+        self._name_series("pose_error/heading", POSE_TURNS)
         if scene.has_errors:
             self._name_series("errors/found", SHARES.values())
             self._name_series("errors/lengths", LENGTHS.values())
@@ -235,9 +239,11 @@ class RerunViewer:
             show_labels=True,
         )
 
-    def show_pose_error(self, position: int, stamp: int, metres: float, radians: float) -> None:
-        """How far the pose in use is from the true one."""
-        self._pose_errors.append((position, stamp, metres, radians))
+    def show_pose_error(self, position: int, stamp: int, metres: float, radians: float, pose: Pose2D) -> None:
+        """How far the pose in use is from the true one, and how far it is told to be."""
+        told_metres, told_radians = told_std(pose)
+        lengths, turns = (1000 * metres, 1000 * told_metres), (math.degrees(radians), math.degrees(told_radians))
+        self._pose_errors.append(((position, stamp), lengths, turns))
 
     def event(self, position: int, stamp: int, text: str, warning: bool = False) -> None:
         """A line for the log of events."""
@@ -314,11 +320,10 @@ class RerunViewer:
             self._send_trail(entries[-1])
         errors, self._pose_errors = self._pose_errors, []
         if errors:
-            index = _index([(position, stamp) for position, stamp, _, _ in errors])
-            millimetres = [metres * 1000 for _, _, metres, _ in errors]
-            degrees = [math.degrees(radians) for _, _, _, radians in errors]
-            self._columns("pose_error/position", index, rr.Scalars.columns(scalars=millimetres))
-            self._columns("pose_error/heading", index, rr.Scalars.columns(scalars=degrees))
+            times, lengths, turns = zip(*errors, strict=True)
+            index = _index(times)
+            self._columns("pose_error/position", index, rr.Scalars.columns(scalars=lengths))
+            self._columns("pose_error/heading", index, rr.Scalars.columns(scalars=turns))
 
     def _send_scans(self, index: Sequence[Any], entries: list[_ScanEntry]) -> None:
         counts = [len(entry.points) for entry in entries]
@@ -410,7 +415,8 @@ def _blueprint(scene: Scene) -> rrb.Blueprint:
         unit = rrb.ScalarAxis(range=(0.0, 1.02), zoom_lock=True)
         right.append(_series("scores", "Map accuracy", axis_y=unit))
     if scene.has_pose_errors:
-        right.append(_series("pose_error", "Pose error"))
+        place, turn = _series("pose_error/position", "Pose error"), _series("pose_error/heading", "Heading error")
+        right.append(rrb.Tabs(place, turn, active_tab=0))
     right += [_series("timing", "Stage timings"), rrb.TextLogView(origin="events", name="Events")]
     shares = [2.0, *[2.0] * (len(right) - 2), 1.2]
     return rrb.Blueprint(
@@ -429,6 +435,14 @@ def _series(origin: str, name: str, **properties: Any) -> rrb.TimeSeriesView:
 def _values(errors: DetectionErrors, series: Iterable[str], unit: float) -> list[float]:
     """Some of the errors, in a plot's units; what there is not leaves a gap."""
     return [math.nan if (value := getattr(errors, name)) is None else unit * value for name in series]
+
+
+def told_std(pose: Pose2D) -> tuple[float, float]:
+    """How unsure a pose's place (m, both axes together) and heading (rad) are told to be; NaN where nobody knows."""
+    if pose.covariance is None:
+        return math.nan, math.nan
+    xx, yy, tt = np.diag(pose.covariance).tolist()
+    return math.sqrt(xx + yy), math.sqrt(tt)
 
 
 def confidence_ellipse(pose: Pose2D) -> FloatArray:

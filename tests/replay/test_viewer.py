@@ -1,5 +1,6 @@
 """What the recording holds, read back; and a picture of it, where this machine can render one."""
 
+import math
 import os
 import subprocess
 import sys
@@ -124,7 +125,23 @@ def test_pose_errors_are_drawn_where_poses_are_compared(noisy_session: Session, 
     result = replayed(noisy_session.path, tmp_path / "a.rrd", pose="odom")
     errors = timed(rows_of(tmp_path / "a.rrd")["/pose_error/position"])
     assert len(errors) == result.scans
-    assert value(errors[-1], "scalars") == pytest.approx([0], abs=1e-6)
+    error, told = value(errors[-1], "scalars")
+    assert error == pytest.approx(0, abs=1e-6) and math.isnan(told)
+
+
+def test_fused_poses_are_drawn_with_how_sure_they_are(noisy_session: Session, tmp_path: Path) -> None:
+    result = replayed(noisy_session.path, tmp_path / "a.rrd", pose="fused")
+    rows = rows_of(tmp_path / "a.rrd")
+    error, told = value(timed(rows["/pose_error/position"])[-1], "scalars")
+    assert 0 <= error < 5 * told
+    ellipses = timed(rows["/map/laser_95_percent"])
+    assert len(ellipses) == result.scans
+    ring = np.array(value(ellipses[-1], "strips")[0])[:, :2]
+    pose, covariance = result.poses.poses[-1], result.poses.covariances
+    assert covariance is not None
+    off = ring - pose[:2]
+    squared = np.einsum("ni,ij,nj->n", off, np.linalg.inv(covariance[-1][:2, :2]), off)
+    assert squared == pytest.approx(5.991, rel=1e-2)  # two degrees of freedom: 95 %
 
 
 def test_a_selection_and_a_rate(noisy_session: Session, tmp_path: Path) -> None:
