@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 from detect.beams import FAMILY, Beams, Sensor, in_table, parameters
 from detect.candidates import Candidate
 from detect.evidence import exact_costs
-from detect.raycost import MEASURED, RANGE, STOP, not_below, trace
+from detect.fit import TIES
+from detect.raycost import MEASURED, PARAMETERS, RANGE, STOP, not_below, slopes, trace
 from prim.raycast import FloatArray
 from prim.shapes import Primitive
 
@@ -27,6 +28,16 @@ FEW = 20
 
 FEW_OF_SCAN = 4
 """Fewer rays of one scan than this do not tell how far it is off as a whole."""
+
+CLEARLY = 1.1
+"""Scans are off as a whole where the squares of their mean errors are larger by such a factor."""
+
+STRETCHES = (3, 10, 30)
+FEW_STRETCHES = 6
+"""How far scans are off together is asked of so many at once, where there are a few such stretches."""
+
+LEAST_BLUR = 0.004
+"""Silhouettes are blurred by this much (m) at least when it is asked which way they ought to move."""
 
 CLEAR_ERROR = 4.0
 """A ray that is off by more standard deviations than this met something else."""
@@ -58,7 +69,10 @@ def measured(candidates: Sequence[Candidate], sensor: Sensor, noise_std: float |
     std = noise_std or measured_noise(candidates, sensor)
     sensor = Sensor.of(std, sensor.span, sensor.footprint, most=sensor.most)
     footprint = measured_footprint(candidates, sensor)
-    return Sensor.of(std, sensor.span, footprint, measured_dispersion(candidates, sensor), sensor.most)
+    dispersion = measured_dispersion(candidates, sensor)
+    if footprint > 0 or dispersion > CLEARLY:
+        dispersion = max(dispersion, dispersion_over_time(candidates, replace(sensor, footprint=footprint)))
+    return Sensor.of(std, sensor.span, footprint, dispersion, sensor.most)
 
 
 def measured_footprint(candidates: Sequence[Candidate], sensor: Sensor) -> float:
@@ -88,6 +102,56 @@ def measured_dispersion(candidates: Sequence[Candidate], sensor: Sensor) -> floa
         squares += float((total[many] ** 2 / count[many]).sum())
         scans += int(np.count_nonzero(many))
     return max(squares / scans, 1.0) if scans >= FEW else 1.0
+
+
+def dispersion_over_time(candidates: Sequence[Candidate], sensor: Sensor) -> float:
+    """By how much what stretches of scans say of candidates differs more than independent rays would make it; or 1.
+
+    Where poses are off for a while, what all rays of that while say is off together, of silhouettes too. For each
+    stretch that is the slope of its rays' likelihood in the candidate's parameters; over all stretches these scatter
+    as the information of the rays says (a sandwich, clustered by time; the longest stretch that tells more counts).
+    """
+    scores = [
+        score
+        for one in candidates
+        if (score := _scores(one, one.seen_before(candidates, sensor), sensor)) is not None
+    ]
+    most = 1.0
+    for length in STRETCHES:
+        squares, freedom = 0.0, 0
+        for score in scores:
+            stretches = len(score) // length
+            if stretches < FEW_STRETCHES:
+                continue
+            sums = score[: stretches * length].reshape(stretches, length, -1).sum(axis=1)
+            sums -= sums.mean(axis=0)
+            whole = len(score) / (stretches * length) * stretches**2 / (stretches - 1)
+            squares += float((sums**2).sum()) * whole
+            freedom += sums.size
+        if freedom and (found := squares / freedom) > 1 + 3 * math.sqrt(2 / freedom):
+            most = max(most, found)
+    return most
+
+
+def _scores(candidate: Candidate, beams: Beams, sensor: Sensor) -> FloatArray | None:
+    """What each scan's rays say of a candidate's own parameters (S, K), in units that independent rays make 1 / S in
+    the square; None where they say too little.
+    """
+    fit = candidate.fits[0]
+    tie, blur = TIES[fit.kind], max(sensor.footprint, LEAST_BLUR)
+
+    def told(some: Beams) -> tuple[FloatArray, FloatArray]:
+        gradient, information = np.zeros(PARAMETERS), np.zeros((PARAMETERS, PARAMETERS))
+        shape = FAMILY[fit.kind], fit.p
+        slopes(*shape, some.rays, some.kinds, 1, sensor.std, sensor.table, blur, gradient, information)
+        return tie.T @ gradient, tie.T @ information @ tie
+
+    try:
+        whiten = np.linalg.inv(np.linalg.cholesky(told(beams)[1]))
+    except np.linalg.LinAlgError:
+        return None
+    scans, number = np.unique(beams.scan, return_inverse=True)
+    return np.array([whiten @ told(beams.of(number == k))[0] for k in range(len(scans))])
 
 
 def _without_cut(error: FloatArray, cut: FloatArray) -> FloatArray:
