@@ -155,8 +155,8 @@ class Gatherer:
         self._ranges: list[NDArray[np.float32]] = []
 
     def add(self, scan: Scan, pose: Pose2D) -> None:
-        """Adds a scan, taken by a laser at ``pose``."""
-        self._count += 1
+        """Adds a scan, or the next part of one, taken by a laser at ``pose``."""
+        self._count += scan.first_beam == 0
         if len(self._ranges) < NOISE_SCANS:
             self._ranges.append(scan.ranges)
         away = np.hypot(*(self._centres - (pose.x, pose.y)).T)
@@ -198,7 +198,11 @@ class Gatherer:
 
     def _keep(self, k: int, beams: Beams) -> None:
         """Keeps one scan's rays for a circle; leaves out every other scan where they become too many."""
-        self._kept[k].append(beams)
+        kept = self._kept[k]
+        if kept and kept[-1].scan[0] == beams.scan[0]:
+            kept[-1] = Beams.joined((kept[-1], beams))
+        else:
+            kept.append(beams)
         self._size[k] += len(beams)
         if self._size[k] > 2 * MOST:
             self._kept[k] = self._kept[k][::2]

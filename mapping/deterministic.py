@@ -5,8 +5,9 @@ from __future__ import annotations
 import math
 
 import numpy as np
+from numpy.typing import NDArray
 
-from mapping.grid import UNKNOWN, Layer, OccupancyGrid
+from mapping.grid import UNKNOWN, GridFrame, Layer, OccupancyGrid
 from mapping.rays import FREE, OCCUPIED, UNSEEN, end_extent, mark
 from prim.frames import Pose2D, Scan
 from prim.world import Bounds
@@ -29,16 +30,23 @@ class DeterministicMapper:
     def __init__(self, resolution: float = 0.01, bounds: Bounds | None = None) -> None:
         self.resolution = resolution
         self._layer = Layer(resolution, bounds, UNSEEN, np.uint8)
+        self._hits: list[tuple[GridFrame, NDArray[np.int64]]] = []
 
     def update(self, scan: Scan, pose: Pose2D) -> None:
-        """Adds one scan, taken by a laser at ``pose`` in the map frame."""
+        """Adds one scan, or the next part of one, taken by a laser at ``pose`` in the map frame."""
         place = (pose.x, pose.y, math.cos(pose.theta), math.sin(pose.theta))
         limits = (scan.range_min, scan.range_max)
         rays = (scan.ranges, scan.directions, place, limits, 1 / self.resolution)
         layer = self._layer
         if not layer.fixed:
             layer.cover(*end_extent(*rays))
-        mark(layer.array, layer.frame.row, layer.frame.col, *rays)
+        hits = mark(layer.array, layer.frame.row, layer.frame.col, *rays)
+        if scan.first_beam == 0:
+            self._hits.clear()
+        for frame, earlier in self._hits:  # of the same scan: its end points come after all its rays
+            if frame == layer.frame:
+                layer.array.reshape(-1)[earlier] = OCCUPIED
+        self._hits.append((layer.frame, hits))
 
     keep = update
 

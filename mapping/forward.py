@@ -164,8 +164,11 @@ class ForwardMapper:
         return self._noise.wild
 
     def update(self, scan: Scan, pose: Pose2D) -> None:
-        """Adds one scan, taken by a laser at ``pose`` in the map frame."""
-        if not self.keep(scan, pose):
+        """Adds one scan, or the next part of one, taken by a laser at ``pose`` in the map frame.
+
+        The map so far takes up further parts with the next scan.
+        """
+        if not self.keep(scan, pose) or scan.first_beam:
             return
         frame = self._stream_frame()
         if self._stream is None:

@@ -403,7 +403,7 @@ def look(
     alone is found.
 
     Fills ``found`` (11,): log-likelihood, its slope (3), the information as six numbers xx, xy, xt, yy, yt, tt (sums
-    of products of single rays' slopes: Berndt, Hall, Hall and Hausman 1974), and how many rays said anything.
+    of products of single rays' slopes: Berndt, Hall, Hall and Hausman 1974), and how many rays are on the map.
     """
     longest = stopping.shape[0] + stopping.shape[1] + CHUNK
     where, share = np.empty(longest, np.int64), np.empty(longest, np.float32)
@@ -439,18 +439,18 @@ def look(
             kind, count, _, _, _, density = follow(
                 x, y, beam, cells, stopping, 0, spread, epsilon, table, where, chance, apart, share
             )
-            counts = counts and count >= 0
+            if count < 0:  # off the map: no likelier than what has nothing to do with it
+                kind = measured(beam[2], cells[0], cells[1], spread)[0]
+                density = epsilon * wild(kind, cells[0], cells[1])
             log_density = math.log(density * per_metre if kind == MEASURED else density)
             if k == 0:
-                here = log_density
+                here, counts = log_density, count >= 0
             elif k % 2:
                 slope[(k - 1) // 2] = log_density
             else:
                 slope[(k - 1) // 2] = (slope[(k - 1) // 2] - log_density) / (2 * nudges[(k - 1) // 2])
-        if not counts:
-            continue
         found[0] += here
-        found[10] += 1
+        found[10] += counts
         if looks > 1:
             a, b, c = slope[0], slope[1], slope[2]
             found[1] += a

@@ -18,6 +18,9 @@ from prim.raycast import FloatArray
 NUDGE_CELLS, NUDGE_SPREAD = 0.5, 0.2
 """Derivatives are taken by differences over this many cells, or over this share of the noise where that is larger."""
 
+LEAST_CELLS = 0.5
+"""The noise counts as this many cells at least: a cell does not say where in it a surface stands."""
+
 NUDGE_REACH = 1.0
 """A turn moves what is this far off (m) as far as the differences of place do."""
 
@@ -90,7 +93,8 @@ class Likelihood:
     @classmethod
     def of(cls, level: Level | Fit, noise: Noise) -> Likelihood:
         """The likelihood under a level's map, or a fit's."""
-        return cls(level.frame, level.stopping, noise)
+        std = max(noise.std, LEAST_CELLS * level.frame.resolution)
+        return cls(level.frame, level.stopping, Noise(std, noise.wild))
 
     def look(self, beams: Beams, pose: FloatArray, mount: FloatArray, widened: float = 1.0) -> Look:
         """A scan from a robot at ``pose`` (3,) whose laser is mounted at ``mount`` (3,); noise ``widened`` times."""

@@ -114,7 +114,7 @@ class Scan:
     """One turn of a LiDAR: ``ranges`` (N,) in metres at bearings angle_min + i * angle_increment (rad).
 
     Follows sensor_msgs/LaserScan and REP 117: +inf is no return, -inf a return nearer than ``range_min``, NaN
-    no measurement.
+    no measurement. A part of a turn says which of the turn's beams is its ``first_beam``.
     """
 
     stamp: int
@@ -126,6 +126,7 @@ class Scan:
     ranges: NDArray[np.float32]
     time_increment: float = 0.0
     scan_time: float = 0.0
+    first_beam: int = 0
 
     @property
     def problem(self) -> str | None:

@@ -15,6 +15,9 @@ from replay.kalman import BIAS, FIX_STD, GATES, HEADING_STD, METRES, RADIANS, RE
 LEVER = 0.03
 """A turn by one radian wears on the odometry as so many metres of way."""
 
+STANDING = 4e-4
+"""A second wears on the odometry as so many metres of way, whether the robot moves or not: by 1 mm, as a rule."""
+
 DEFAULT_ODOMETRY = 0.05, math.radians(2)
 """Odometry's noise after one metre (m, rad), where a log tells nothing about it."""
 
@@ -41,7 +44,7 @@ NUDGE, BIAS_NUDGE = 0.05, 0.005
 """Steps of the differences that derivatives are taken by: in logarithms, and in rad."""
 
 MOST_NODES = 20_000
-"""The noise is found from at most about so many nodes, evenly spread."""
+"""The noise is found from at most about so many nodes with readings, evenly spread."""
 
 BIAS_SCORE = 12.0
 """A compass is taken to be biased where the likelihood says so: one in 2000 that are not (chi squared)."""
@@ -105,11 +108,8 @@ class Nodes:
             headings=self.headings[piece],
         )
 
-    def thinned(self, stride: int) -> Nodes:
-        """Every ``stride``-th node, with the steps between them."""
-        if stride <= 1:
-            return self
-        kept = slice(None, None, stride)
+    def only(self, kept: NDArray[np.intp]) -> Nodes:
+        """Some of the nodes (by rising index, the first one among them), with the steps between them."""
         walked = walk(self.steps)[kept]
         ways = np.diff(np.cumsum(self.ways)[kept], prepend=0.0)
         return replace(
@@ -193,6 +193,7 @@ def nodes_at(
         start, steps = walked[0], steps_between(walked)
         ways = np.diff(np.interp(every, odometry.stamps, way_of(odometry)), prepend=0.0)
         ways[0] = 0.0
+        ways += STANDING * np.diff(every, prepend=every[0]) / 1e9
     return Nodes(
         every,
         steps,
@@ -254,16 +255,22 @@ class Fusion:
 
     @property
     def noise(self) -> PoseNoise:
-        """The noise as given or found; None for sensors that are not there."""
+        """The noise as given or found; None where it is neither."""
         fixes, headings, metres, radians, bias = self._noise.tolist()
-        has_fixes, has_headings = self.nodes.has_fixes.any(), self.nodes.has_headings.any()
+        has_fixes, has_headings = bool(self.nodes.has_fixes.any()), bool(self.nodes.has_headings.any())
+        given = self._given
         return PoseNoise(
             fixes if has_fixes else None,
             headings if has_headings else None,
-            metres,
-            radians,
+            metres if has_fixes or given.metres else None,
+            radians if has_fixes or has_headings or given.radians else None,
             bias if has_headings else None,
         )
+
+    @property
+    def odometry_std(self) -> FloatArray:
+        """What is reckoned with: the odometry's standard deviations (3,) after one metre of way, m, m, rad."""
+        return self._noise[[METRES, METRES, RADIANS]]
 
     def filtered(self) -> Estimate:
         """Each pose from what was measured until then."""
@@ -415,10 +422,11 @@ class Fusion:
 
     def _learn(self) -> None:
         """Finds the noise by maximum likelihood of the innovations, and whether the compass is biased."""
-        nodes = self.nodes.thinned(-(-len(self.nodes.stamps) // MOST_NODES))
         unknown = self._unknown()
         if not unknown:
             return
+        told = np.flatnonzero(self.nodes.has_fixes | self.nodes.has_headings)[:: self._stride()]
+        nodes = self.nodes.only(np.union1d([0], told))
         self._noise = self._likeliest(nodes, unknown)
         both = nodes.moves and nodes.has_headings.any() and nodes.has_fixes.any()
         if not (both and self._given.bias is None):
@@ -427,6 +435,11 @@ class Fusion:
         if slope.sum() ** 2 > BIAS_SCORE * (slope**2).sum():
             self._noise = self._likeliest(nodes, [*unknown, BIAS])
 
+    def _stride(self) -> int:
+        """Every how many readings are enough to find the noise from."""
+        told = np.count_nonzero(self.nodes.has_fixes | self.nodes.has_headings)
+        return max(1, -(-int(told) // MOST_NODES))
+
     def _likeliest(self, nodes: Nodes, unknown: list[int]) -> FloatArray:
         """The most likely noise (Berndt, Hall, Hall and Hausman 1974): scoring steps, halved where they overshoot."""
         noise, usual = self._noise.copy(), self._noise.copy()
@@ -434,7 +447,7 @@ class Fusion:
         for _ in range(MOST_ROUNDS):
             slopes = self._slopes(nodes, noise, unknown)
             believed = -_off(noise, usual, unknown) / PRIOR_SPREAD**2
-            information = slopes.T @ slopes + np.diag(_weights(unknown))
+            information = slopes.T @ slopes + np.diag(_weights(unknown)) + 1e-9 * np.eye(len(unknown))
             step = np.linalg.solve(information, slopes.sum(axis=0) + believed)
             step = np.clip(step, -1.5, 1.5)
             share = 1.0

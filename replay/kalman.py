@@ -102,11 +102,13 @@ def learn_from_scan(state: Any, cov: Any, slope: Any, information: Any, looked_f
 
 @inline
 def take_fix(
-    state: Any, cov: Any, x: float, y: float, lever: Any, variance: float, gate: float, missed: int
+    state: Any, cov: Any, before: Any, x: float, y: float, lever: Any, variance: float, gate: float, missed: int
 ) -> tuple[float, int]:
     """A position fix of an antenna that stands at ``lever`` on the robot: its cost, and how many in a row are missed.
 
-    The cost is minus twice the log-likelihood, but for a constant; that of one which is not used ends at the gate.
+    A robot that was carried elsewhere made a step that nobody measured: ``before``, the covariance that was
+    predicted, gets its variance as well, so that the smoother does not lay the jump on earlier steps. The cost is
+    minus twice the log-likelihood, but for a constant; that of one which is not used ends at the gate.
     """
     cos, sin = math.cos(state[2]), math.sin(state[2])
     lx, ly = cos * lever[0] - sin * lever[1], sin * lever[0] + cos * lever[1]
@@ -122,6 +124,8 @@ def take_fix(
             return gate + size, missed + 1
         cov[0] += nx * nx
         cov[3] += ny * ny
+        before[0] += nx * nx
+        before[3] += ny * ny
     corrected(state, cov, 1.0, 0.0, -ly, variance, nx)
     ny = y - state[1] - (math.sin(state[2]) * lever[0] + math.cos(state[2]) * lever[1])
     corrected(state, cov, 0.0, 1.0, lx, variance, ny)
@@ -130,7 +134,7 @@ def take_fix(
 
 @inline
 def take_heading(
-    state: Any, cov: Any, heading: float, variance: float, gate: float, missed: int
+    state: Any, cov: Any, before: Any, heading: float, variance: float, gate: float, missed: int
 ) -> tuple[float, int]:
     """A heading: its cost, and how many in a row are missed (as take_fix)."""
     off = wrapped(heading - state[2])
@@ -141,6 +145,7 @@ def take_heading(
         if missed < PATIENCE:
             return gate + size, missed + 1
         cov[5] += off * off
+        before[5] += off * off
     corrected(state, cov, 0.0, 0.0, 1.0, variance, off)
     return min(squared, gate) + size, 0
 
@@ -187,14 +192,14 @@ def run(
         costs[k] = 0.0
         verdicts[k] = 0
         if not math.isnan(fixes[k, 0]):
-            cost, missed = take_fix(state, cov, fixes[k, 0], fixes[k, 1], lever, fix_variance, gates[0], lost_fixes)
+            x, y, before = fixes[k, 0], fixes[k, 1], predicted_covs[k]
+            cost, missed = take_fix(state, cov, before, x, y, lever, fix_variance, gates[0], lost_fixes)
             costs[k] += cost
             verdicts[k, 0] = REJECTED if missed else USED
             lost_fixes = missed
         if not math.isnan(headings[k]):
-            cost, missed = take_heading(
-                state, cov, headings[k] - noise[BIAS], heading_variance, gates[1], lost_headings
-            )
+            heading, before = headings[k] - noise[BIAS], predicted_covs[k]
+            cost, missed = take_heading(state, cov, before, heading, heading_variance, gates[1], lost_headings)
             costs[k] += cost
             verdicts[k, 1] = REJECTED if missed else USED
             lost_headings = missed

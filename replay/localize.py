@@ -82,8 +82,8 @@ class LaserPoses:
 class Sensor:
     """A sensor that poses were fused from: how many readings were used, and how many were too far off to be.
 
-    ``std`` is its noise by name, in SI units: ``m`` and ``rad``; the odometry's after one metre of way. ``bias``
-    (rad) is what a compass is off by all the time.
+    ``std`` is its noise by name, in SI units, as far as it was given or found: ``m`` and ``rad``; the odometry's
+    after one metre of way. ``bias`` (rad) is what a compass is off by all the time.
     """
 
     name: str
@@ -182,11 +182,19 @@ class Localizer:
         if source == FUSED:
             return self._from_fusion(scans)
         chain = self._fixed_chain(scans.frame_id)
-        if source == "auto" and chain[-1] != MAP_FRAME and self._can_fuse():
-            return self._from_fusion(scans)
-        if source == "tf" or len(chain) > 1:
-            return self._from_tf(scans, chain)
-        return self._from_odometry(scans, source)
+        reason: tuple[str, ...] = ()
+        if source == "auto" and chain[-1] != MAP_FRAME:
+            try:
+                if self._can_fuse():
+                    return self._from_fusion(scans)
+            except LogReadError as error:
+                if replace(self._fuse, noise=PoseNoise()) != FuseOptions():
+                    raise
+                reason = (f"nothing is fused: {error.what}",)
+        found = (
+            self._from_tf(scans, chain) if source == "tf" or len(chain) > 1 else self._from_odometry(scans, source)
+        )
+        return replace(found, notes=found.notes + reason)
 
     @property
     def has_truth(self) -> bool:
@@ -254,10 +262,15 @@ class Localizer:
         """The topics of odometry, GPS and compass; None for those that are not there or not wanted."""
         fuse = self._fuse
         return (
-            self._odometry_topic() if ODOM in fuse.sensors else None,
+            self._wheels() if ODOM in fuse.sensors else None,
             find_gps(self._log, fuse.gps_topic) if GPS in fuse.sensors else None,
             find_compass(self._log, fuse.compass_topic) if COMPASS in fuse.sensors else None,
         )
+
+    def _wheels(self) -> Topic | None:
+        """The topic of odometry: the one asked for, or the one of that type. A PoseStamped may be anything."""
+        topic = self._odometry_topic()
+        return topic if topic and (topic.type == ODOMETRY_TYPE or self._odom_topic) else None
 
     def _from_fusion(self, scans: ScanTimes) -> LaserPoses:
         """The laser's poses by odometry, GPS and compass together, smoothed."""
@@ -296,26 +309,27 @@ class Localizer:
     def _nodes(self, scans: ScanTimes, base: str, sensed: Sensed) -> Nodes:
         """What is known of the base's motion, at the scans' stamps and at those of the readings."""
         gps, compass = sensed.gps, sensed.compass
-        lever = self._fixed_mount(gps.frame_id, base) if gps else Pose2D()
+        lever = self._fixed_mount(gps.frame_id, base)[1] if gps else np.zeros(3)
+        turn = self._fixed_mount(compass.frame_id, base)[0] if compass else np.eye(3)
         try:
             return nodes_at(
                 scans.wanted,
                 sensed.odometry.trajectory if sensed.odometry else None,
-                (gps.stamps, gps.values) if gps else None,
-                (compass.stamps, headings(compass, self._fixed_mount(compass.frame_id, base))) if compass else None,
-                (lever.x, lever.y),
+                (gps.stamps, gps.values[:, :2]) if gps else None,
+                (compass.stamps, headings(compass, turn)) if compass else None,
+                (float(lever[0]), float(lever[1])),
             )
         except ValueError:
             what = f"no scan lies within the time of {sensed.topics}"
             raise LogReadError(self._log.path, what, "two clocks in one log? give another --pose") from None
 
-    def _fixed_mount(self, frame: str, base: str) -> Pose2D:
-        """Where a sensor's frame stands on the robot by static transforms; the base itself where there are none."""
+    def _fixed_mount(self, frame: str, base: str) -> tuple[FloatArray, FloatArray]:
+        """How a sensor's frame stands on the robot: rotation (3, 3), translation (3,); the base's own without one."""
         tree, chain = self._chain_to(base, frame)
         if len(chain) < 2:
-            return Pose2D()
+            return np.eye(3), np.zeros(3)
         rotation, translation, _ = tree.lookup(chain, np.zeros(1, dtype=np.int64))
-        return Pose2D(*flatten(rotation, translation)[0][0].tolist())
+        return rotation[0], translation[0]
 
     def stand_still(self, scans: ScanTimes) -> LaserPoses:
         """A robot at the map's origin all the time, its laser where the offset or tf puts it."""
@@ -423,16 +437,21 @@ def carried(covariances: FloatArray, poses: FloatArray, mounts: FloatArray) -> F
 
 
 def _sensors(sensed: Sensed, estimate: Estimate) -> Iterator[Sensor]:
-    """The sensors that were fused, with the noise that was found."""
+    """The sensors that were fused, with the noise that was given or found; without it where it is neither."""
     noise = estimate.noise
     if sensed.odometry is not None:
-        std = {"m": noise.metres or 0.0, "rad": noise.radians or 0.0}
+        std = _known(m=noise.metres, rad=noise.radians)
         yield Sensor(ODOM, sensed.odometry.topic, len(sensed.odometry.trajectory), 0, std)
     if sensed.gps is not None:
-        yield Sensor(GPS, sensed.gps.topic, *estimate.used(0), {"m": noise.fixes or 0.0})
+        yield Sensor(GPS, sensed.gps.topic, *estimate.used(0), _known(m=noise.fixes))
     if sensed.compass is not None:
-        std = {"rad": noise.headings or 0.0}
+        std = _known(rad=noise.headings)
         yield Sensor(COMPASS, sensed.compass.topic, *estimate.used(1), std, noise.bias or 0.0)
+
+
+def _known(**std: float | None) -> dict[str, float]:
+    """The standard deviations that are known."""
+    return {unit: value for unit, value in std.items() if value is not None}
 
 
 def _fusion_notes(sensors: Sequence[Sensor]) -> tuple[str, ...]:

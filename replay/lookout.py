@@ -78,7 +78,8 @@ class Lookout:
         self._truth = truth
         self._noise_std = noise_std
         self._frame_covariance = frame_covariance
-        self._scans: list[tuple[Scan, Pose2D]] = []
+        self._scans: list[list[tuple[Scan, Pose2D]]] = []
+        self._keeps = False
         self._before: Detections | None = None
         self._count, self._stride = 0, 1
         self._searched_at = 0
@@ -98,8 +99,13 @@ class Lookout:
 
     def _keep_some(self, scan: Scan, pose: Pose2D) -> None:
         """Keeps scans for looks on the way, evenly spread: every other one goes where they become too many."""
-        if self._count % self._stride == 0:
-            self._scans.append((scan, pose))
+        if scan.first_beam:
+            if self._keeps:
+                self._scans[-1].append((scan, pose))
+            return
+        self._keeps = self._count % self._stride == 0
+        if self._keeps:
+            self._scans.append([(scan, pose)])
         self._count += 1
         if len(self._scans) >= 2 * SCANS_ON_THE_WAY:
             self._scans = self._scans[::2]
@@ -134,7 +140,8 @@ class Lookout:
         if anew:
             self._searched_at = self._count
         before = None if anew else self._before
-        refined, noise_std = refine_detections(detections, self._scans, grid, self._noise_std, cores(), before)
+        some = [part for scan in self._scans for part in scan]
+        refined, noise_std = refine_detections(detections, some, grid, self._noise_std, cores(), before)
         self._before = refined
         return self._in_unsure_frame(refined), noise_std
 

@@ -17,6 +17,7 @@ from mapping.forward import ForwardMapper
 from mapping.matching import Beams, Likelihood, climb
 from prim.frames import Pose2D, Scan, Stamps, Trajectory, wrap_angles
 from prim.raycast import FloatArray
+from prim.world import Bounds
 from replay.fusion import Fusion, PoseNoise, nodes_at, six_of, steps_between
 from replay.kalman import LEAST_VARIANCE
 from replay.localize import LaserPoses, carried, compose
@@ -46,6 +47,9 @@ LEAST_GAIN = 3e-3
 ADAPTS = 0.3
 """How quickly the odometry is taken to be worse than was thought, where the scans say so."""
 
+UNTOLD = 10.0
+"""Steps between poses that do not drift are off by so many times what the poses are: they tell next to nothing."""
+
 MOST_WORSE = 1e4
 
 LEAST_RAYS = 10
@@ -61,14 +65,17 @@ def match(
     resolution: float,
     noise_std: float | None = None,
     noise: PoseNoise | None = None,
+    bounds: Bounds | None = None,
 ) -> LaserPoses:
     """The laser's poses corrected by a map with cells of ``resolution`` (m), made of the scans themselves.
+
+    It grows with the scans unless ``bounds`` are given.
 
     ``posed`` gives the scans with the poses that it is given, ``stamps`` (N,) are all scans'. ``noise_std`` (m) is
     the range noise where it is known. Poses that were not fused are taken for odometry of such ``noise``; or, where
     that tells of fixes and headings, for poses that do not drift and are off by so much each.
     """
-    return Matcher(poses, stamps, posed, resolution, noise_std, noise).run()
+    return Matcher(poses, stamps, posed, resolution, noise_std, noise, bounds).run()
 
 
 class Matcher:
@@ -82,17 +89,18 @@ class Matcher:
         resolution: float,
         noise_std: float | None,
         noise: PoseNoise | None,
+        bounds: Bounds | None,
     ) -> None:
         self._poses, self._posed = poses, posed
-        self._resolution, self._noise_std = resolution, noise_std
+        self._resolution, self._noise_std, self._bounds = resolution, noise_std, bounds
         known = noise or PoseNoise()
-        self._drifts = poses.fusion is None and (known.fixes is None or known.headings is None)
         if poses.fusion is not None:
             self._fusion = poses.fusion
         elif known.fixes is not None and known.headings is not None:
             self._fusion = _steady(poses, stamps, known.fixes, known.headings)
         else:
             self._fusion = _drifting(poses, stamps, known)
+        self._drifts = not self._fusion.nodes.has_fixes.any()
         self._mounts = np.zeros_like(poses.poses) if poses.mounts is None or not poses.fusion else poses.mounts
         nodes = self._fusion.nodes.stamps
         self._node = np.searchsorted(nodes, np.clip(stamps, nodes[0], nodes[-1]))
@@ -115,10 +123,10 @@ class Matcher:
 
     def _as_the_map_grows(self) -> None:
         """Each scan matched to the map of those before it; all of them anew whenever they are twice as many."""
-        mapper = ForwardMapper(self._resolution, None, self._noise_std, stream_cells=CELLS)
+        mapper = ForwardMapper(self._resolution, self._bounds, self._noise_std, stream_cells=CELLS)
         state, spread = self._fusion.start
         at, due = -1, FIRST_ROUND
-        for posed in self._posed(self._poses):
+        for posed in sorted(self._posed(self._poses), key=lambda posed: int(self._node[posed.position])):
             node, mount = int(self._node[posed.position]), self._mounts[posed.position]
             if node > at:
                 state, spread = self._fusion.advance(at + 1, node + 1, state, spread, self._worse)
@@ -151,14 +159,18 @@ class Matcher:
         how many of the nodes the scans so far belong to; None: all.
         """
         reached, widened = -math.inf, 0.0
-        for number in range(most + 1):
+        before = self._robot, self._spread
+        for _ in range(most):
             likelihood = self._map()
             widened = widened or widening(off, likelihood)
             fits, rows = self._looks(likelihood, widened)
-            if number == most or (widened == 1.0 and fits - reached < LEAST_GAIN):
+            if widened == 1.0 and fits < reached:
+                self._robot, self._spread = before
+            if widened == 1.0 and fits - reached < LEAST_GAIN:
                 break
             reached = fits if widened == 1.0 else reached
             widened = max(widened / 2, 1.0)
+            before = self._robot.copy(), self._spread.copy()
             self._smooth(rows, nodes)
 
     def _smooth(self, rows: FloatArray, nodes: int | None) -> None:
@@ -169,11 +181,12 @@ class Matcher:
 
     def _misled(self, nodes: int | None) -> float:
         """How many times the odometry's variances the corrections of its steps are."""
-        part, noise = self._fusion.nodes.part(0, nodes), self._fusion.noise
-        if len(part.steps) < 2 or noise.metres is None or noise.radians is None:
+        part = self._fusion.nodes.part(0, nodes)
+        if len(part.steps) < 2:
             return 1.0
         off = steps_between(self._robot[:nodes])[1:] - part.steps[1:]
-        variances = part.ways[1:, None] * np.array([noise.metres, noise.metres, noise.radians]) ** 2 + LEAST_VARIANCE
+        off[:, 2] = wrap_angles(off[:, 2])
+        variances = part.ways[1:, None] * self._fusion.odometry_std**2 + LEAST_VARIANCE
         return min(float((off**2 / variances).mean()), MOST_WORSE)
 
     def _map(self) -> Likelihood:
@@ -183,7 +196,7 @@ class Matcher:
 
     def _kept(self) -> ForwardMapper:
         """A mapper that was given the scans so far from where they are believed to have been taken."""
-        mapper = ForwardMapper(self._resolution, None, self._noise_std, stream_cells=CELLS)
+        mapper = ForwardMapper(self._resolution, self._bounds, self._noise_std, stream_cells=CELLS)
         for posed in self._scans:
             for scan, pose in moved(posed, self._laser(posed.position)):
                 mapper.keep(scan, pose)
@@ -237,6 +250,9 @@ class Matcher:
         robot = self._robot[self._node]
         poses = compose(robot, self._mounts)
         covariances = carried(np.array([square(six) for six in self._spread[self._node]]), robot, self._mounts)
+        covariances[:, [0, 1], [0, 1]] += (
+            self._resolution**2 / 12
+        )  # a map does not say where in its cells walls stand
         if self._poses.frame_covariance is not None:
             covariances = covariances + moved_frame(self._poses.frame_covariance, poses)
         ends = self._ends(poses)
@@ -268,11 +284,11 @@ def _drifting(poses: LaserPoses, stamps: Stamps, noise: PoseNoise) -> Fusion:
 
 
 def _steady(poses: LaserPoses, stamps: Stamps, metres: float, radians: float) -> Fusion:
-    """Poses that do not drift but are each off by so much: what lies between two of them is off by both."""
+    """Poses that do not drift but are each off by so much; of the way between two of them nothing else is known."""
     trajectory = Trajectory.from_unsorted(stamps[poses.valid], poses.poses[poses.valid])
     fixes, turns = (trajectory.stamps, trajectory.poses[:, :2]), (trajectory.stamps, trajectory.poses[:, 2])
     nodes = replace(nodes_at(trajectory.stamps, trajectory, fixes, turns), ways=np.ones(len(trajectory)))
-    noise = PoseNoise(metres, radians, math.sqrt(2) * metres, math.sqrt(2) * radians, 0.0)
+    noise = PoseNoise(metres, radians, UNTOLD * metres, UNTOLD * radians, 0.0)
     return Fusion(nodes, noise)
 
 

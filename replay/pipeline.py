@@ -98,8 +98,8 @@ class ReplayOptions:
     def _check_poses(self) -> None:
         if self.standing_still and (self.pose != "auto" or self.odom_topic):
             raise UsageError("--standing-still excludes --pose and --odom-topic")
-        if self.standing_still and self.match_scans:
-            raise UsageError("--standing-still excludes --match-scans: there is no motion to correct")
+        if self.standing_still and (self.match_scans or self.fuse != FuseOptions()):
+            raise UsageError("--standing-still excludes --match-scans and all that says how poses are fused")
         fuses = self.pose in ("auto", FUSED)
         if not fuses and replace(self.fuse, noise=PoseNoise()) != FuseOptions():
             raise UsageError(f"--fuse, --gps-topic and --compass-topic do not go with --pose {self.pose}")
@@ -267,7 +267,8 @@ class Pipeline:
         if options.standing_still:
             return localizer.stand_still(times), None
         poses = localizer.locate(times, options.pose)
-        if options.fuse != FuseOptions() and poses.source != FUSED and not options.match_scans:
+        told = replace(options.fuse, noise=PoseNoise()) if options.match_scans else options.fuse
+        if told != FuseOptions() and poses.source != FUSED:
             self._notes.append(f"nothing is fused, since there are poses on {poses.origin}: give --pose fused")
         if poses.source == "truth":
             return poses, poses
@@ -285,7 +286,9 @@ class Pipeline:
 
         options = self.options
         posed = partial(self._posed, scans)
-        return match(poses, scans.stamps, posed, options.resolution, options.noise_std, options.fuse.noise)
+        return match(
+            poses, scans.stamps, posed, options.resolution, options.noise_std, options.fuse.noise, options.bounds
+        )
 
     def _frame(self, scans: ScanLog, poses: LaserPoses, truth: Truth | None) -> GridFrame:
         """The map's frame: the bounds given, else the recorded world's and a margin, else the end points'."""
@@ -307,6 +310,8 @@ class Pipeline:
             for posed in self._posed(scans, poses)
             for scan, pose in posed.pieces
         ]
+        if not extents:
+            raise LogReadError(self.path, "no scan that can be used has a pose", "give another --pose")
         row, col = np.min([extent[:2] for extent in extents], axis=0).tolist()
         last_row, last_col = np.max([extent[2:] for extent in extents], axis=0).tolist()
         return GridFrame(self.options.resolution, row, col, last_row - row + 1, last_col - col + 1)
@@ -541,7 +546,7 @@ class Judge:
     @property
     def compares_poses(self) -> bool:
         """Whether the poses are other than the true ones, and held against them."""
-        return self._true_poses is not None and self._poses.source not in ("truth", STILL)
+        return self._true_poses is not None and (self._poses.matched or self._poses.source not in ("truth", STILL))
 
     def update(self, position: int, scan: Scan, stamp: int) -> None:
         """Adds what a perfect sensor would have seen."""

@@ -16,10 +16,13 @@ from mapping.grid import OccupancyGrid
 from prim.errors import OutputError
 from prim.metrics import DetectionErrors
 from prim.shapes import Kind
-from replay.localize import COMPASS, ODOM, LaserPoses, Sensor
+from replay.localize import COMPASS, GPS, ODOM, LaserPoses, Sensor
 from replay.lookout import Sighting
 from replay.pipeline import ReplayResult
 from replay.scans import counted
+
+UNITS = {ODOM: ("m", "rad"), GPS: ("m",), COMPASS: ("rad",)}
+"""What the noise of each sensor is told in."""
 
 SCHEMA = "prim-replay/1"
 
@@ -86,7 +89,7 @@ def _pose_spread(result: ReplayResult) -> dict[str, Any]:
                 "topic": sensor.topic,
                 "used": sensor.used,
                 "rejected": sensor.rejected,
-                **{f"std_{unit}": value for unit, value in sensor.std.items()},
+                **{f"std_{unit}": sensor.std.get(unit) for unit in UNITS[sensor.name]},
                 **({"bias_rad": sensor.bias} if sensor.name == COMPASS else {}),
             }
             for sensor in result.poses.sensors
@@ -262,9 +265,9 @@ def _sensor_noise(sensor: Sensor) -> str:
     """A sensor's noise in words."""
     values = [f"{1000 * sensor.std['m']:.0f} mm"] if "m" in sensor.std else []
     values += [f"{np.degrees(sensor.std['rad']):.1f} deg"] if "rad" in sensor.std else []
-    what = f"{sensor.name} {', '.join(values)}"
+    what = f"{sensor.name} {', '.join(values) or 'unknown'}"
     if sensor.name == ODOM:
-        return f"{what} after 1 m"
+        return f"{what} after 1 m" if values else what
     return f"{what} ({sensor.rejected} of {sensor.used + sensor.rejected} not used)" if sensor.rejected else what
 
 

@@ -17,8 +17,8 @@ from prim.messages import SCAN_TYPE, decode_scan, decode_stamp
 from prim.raycast import FloatArray
 from replay.localize import ScanTimes
 
-LONGEST_SWEEP = 10.0
-"""No laser takes longer (s) for a turn."""
+LONGEST_SWEEP, OVERLAP = 1.0, 1.5
+"""A laser's turn takes no longer (s); nor so many times the time from one scan to the next, where there are two."""
 
 MOST_PIECES = 64
 """A scan whose laser moves meanwhile is cut into no more pieces."""
@@ -72,6 +72,8 @@ class ScanLog:
         self.unusable: dict[int, str] = {}
         decodable, stamps = self._read_stamps()
         self.total = len(stamps)
+        gaps = np.diff(np.unique(stamps))
+        self._longest_sweep = OVERLAP * float(np.median(gaps)) / 1e9 if len(gaps) else LONGEST_SWEEP
         picked = selection.pick(stamps) if self.total else np.zeros(0, dtype=np.intp)
         if not len(picked):
             span = f"{(stamps.max() - stamps.min()) / 1e9:.1f} s" if self.total else "none"
@@ -89,8 +91,12 @@ class ScanLog:
     @property
     def sweep(self) -> int:
         """The time (ns) from a scan's first beam to its last; 0 where the log does not say, or nothing sensible."""
-        seconds = self.first.time_increment * (len(self.first.ranges) - 1)
-        return round(seconds * 1e9) if 0 < seconds <= LONGEST_SWEEP else 0
+        return round(self._told_sweep * 1e9) if 0 < self._told_sweep <= self._longest_sweep else 0
+
+    @property
+    def _told_sweep(self) -> float:
+        """The time (s) from a scan's first beam to its last, as the first scan has it."""
+        return self.first.time_increment * (len(self.first.ranges) - 1)
 
     @property
     def duration(self) -> float:
@@ -112,6 +118,11 @@ class ScanLog:
     def notes(self) -> list[str]:
         """What a user should know of scans that were left out or have odd stamps."""
         notes = []
+        if self._told_sweep and not self.sweep:
+            notes.append(
+                f"scans are not deskewed: by their time_increment a sweep takes {self._told_sweep:.3g} s, where the "
+                f"time from one scan to the next allows {self._longest_sweep:.3g} s"
+            )
         if self.unusable:
             index, problem = min(self.unusable.items())
             notes.append(f"{counted(len(self.unusable), 'scan')} cannot be used, the first one {index}: {problem}")
@@ -175,6 +186,7 @@ def pieces_of(scan: Scan, pose: Pose2D, end: Pose2D | None, tolerance: float) ->
             stamp=scan.stamp + round(first * scan.time_increment * 1e9),
             angle_min=scan.angle_min + first * scan.angle_increment,
             ranges=scan.ranges[first:after],
+            first_beam=first,
         )
         at = Pose2D(pose.x + share * dx, pose.y + share * dy, wrap_angle(pose.theta + share * turn), pose.covariance)
         pieces.append((piece, at))

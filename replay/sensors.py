@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
 
 from prim.errors import LogReadError
-from prim.frames import Pose2D, Stamps, Trajectory
+from prim.frames import Stamps, Trajectory
 from prim.log import LogReader, Topic
 from prim.messages import (
     FIX_TYPE,
@@ -28,8 +29,8 @@ from prim.raycast import FloatArray
 GPS_TYPES = (POINT_TYPE, FIX_TYPE)
 COMPASS_TYPES = (VECTOR_TYPE,)
 GPS_NAMES = ("gps", "gnss", "fix", "navsat")
-COMPASS_NAMES = ("compass", "heading", "north")
-"""Points and vectors on topics with such names are taken for a GPS's and a compass's without being asked."""
+COMPASS_NAMES = ("compass", "north")
+"""Points and vectors on topics with such a word in their names are taken for a GPS's and a compass's unasked."""
 
 EQUATOR, FLATTENING = 6_378_137.0, 1 / 298.257223563
 """The Earth's radius at the equator (m) and its flattening (WGS 84)."""
@@ -54,7 +55,7 @@ class Odometry:
 
 @dataclass(frozen=True)
 class Readings:
-    """What a sensor measured, by rising ``stamps`` (N,): ``values`` (N, 2), metres or the direction of north."""
+    """What a sensor measured, by rising ``stamps`` (N,): ``values`` (N, 3), metres or the direction of north."""
 
     topic: str
     stamps: Stamps
@@ -70,29 +71,30 @@ class Readings:
 
 @dataclass(frozen=True)
 class Sensed:
-    """What poses can be fused from; None for what a log does not have."""
+    """What poses can be fused from; None for what a log does not have. ``notes``: what a user should know."""
 
     odometry: Odometry | None
     gps: Readings | None
     compass: Readings | None
+    notes: tuple[str, ...] = ()
 
     @property
     def topics(self) -> str:
         """The topics, for people."""
         return ", ".join(reading.topic for reading in (self.odometry, self.gps, self.compass) if reading)
 
-    @property
-    def notes(self) -> tuple[str, ...]:
-        """What a user should know."""
-        return sum((reading.notes for reading in (self.odometry, self.gps, self.compass) if reading), ())
-
 
 def read_sensors(log: LogReader, odometry: Topic | None, gps: Topic | None, compass: Topic | None) -> Sensed:
     """What is on the sensors' topics. Raises LogReadError."""
+    moved = read_odometry(log, odometry) if odometry else None
+    fixes = read_gps(log, gps) if gps else None
+    norths = read_compass(log, compass) if compass else None
+    notes = sum((reading.notes for reading in (moved, fixes, norths) if reading), ())
     return Sensed(
-        read_odometry(log, odometry) if odometry else None,
-        read_gps(log, gps) if gps else None,
-        read_compass(log, compass) if compass else None,
+        moved,
+        fixes if fixes and len(fixes.stamps) else None,
+        norths if norths and len(norths.stamps) else None,
+        notes,
     )
 
 
@@ -144,62 +146,60 @@ def _find(
             there = ", ".join(f"{topic.name} ({topic.type})" for topic in topics) or "none"
             raise LogReadError(log.path, f"no {' or '.join(types)} on {wanted}", f"topics of that type: {there}")
         return chosen[0]
-    likely = [topic for topic in topics if any(name in topic.name.lower() for name in names)]
+    likely = [topic for topic in topics if not set(names).isdisjoint(re.split(r"[/_]", topic.name.lower()))]
     if len(likely) > 1:
         listed = ", ".join(topic.name for topic in likely)
         raise LogReadError(log.path, f"{len(likely)} topics to choose from: {listed}", f"choose one with {option}")
     return likely[0] if likely else None
 
 
-def read_gps(log: LogReader, topic: Topic) -> Readings | None:
-    """Position fixes (m): points as they are, satellite fixes east and north of the first one; None if there is none.
-
-    Raises LogReadError.
-    """
+def read_gps(log: LogReader, topic: Topic) -> Readings:
+    """Position fixes (m): points as they are, satellites' as east and north of the first. Raises LogReadError."""
     satellites = topic.type == FIX_TYPE
-    readings = _read(log, topic, decode_fix if satellites else decode_vector, lambda x, y: math.isfinite(x + y))
-    if readings is None or not satellites:
+    readings = _read(
+        log, topic, decode_fix if satellites else decode_vector, lambda fix: math.isfinite(fix.x + fix.y)
+    )
+    if not satellites or not len(readings.stamps):
         return readings
-    return Readings(topic.name, readings.stamps, flattened(readings.values), readings.frame_id, readings.unusable)
+    return replace(readings, values=flattened(readings.values))
 
 
-def read_compass(log: LogReader, topic: Topic) -> Readings | None:
-    """Vectors that point north (x, y in the sensor's frame); None where there is none. Raises LogReadError."""
-    return _read(log, topic, decode_vector, lambda x, y: 1e-9 < math.hypot(x, y) < math.inf)
+def read_compass(log: LogReader, topic: Topic) -> Readings:
+    """Vectors that point north, in the sensor's frame. Raises LogReadError."""
+    return _read(log, topic, decode_vector, lambda north: 1e-9 < math.hypot(north.x, north.y, north.z) < math.inf)
 
 
 def _read(
-    log: LogReader, topic: Topic, decode: Callable[[bytes], StampedVector], accepts: Callable[[float, float], bool]
-) -> Readings | None:
+    log: LogReader, topic: Topic, decode: Callable[[bytes], StampedVector], accepts: Callable[[StampedVector], bool]
+) -> Readings:
     """The usable values of a topic by rising stamp; of those with the same stamp the last."""
-    values: dict[int, tuple[float, float]] = {}
+    values: dict[int, tuple[float, float, float]] = {}
     frame_id = ""
     unusable = 0
     for _, message in log.decoded(topic, decode):
-        if accepts(message.x, message.y):
-            values[message.stamp] = message.x, message.y
+        if accepts(message):
+            values[message.stamp] = message.x, message.y, message.z
             frame_id = message.frame_id.lstrip("/")
         else:
             unusable += 1
-    if not values:
-        return None
     stamps = sorted(values)
-    at = np.array(stamps, dtype=np.int64)
-    return Readings(topic.name, at, np.array([values[stamp] for stamp in stamps]), frame_id, unusable)
+    ordered = np.array([values[stamp] for stamp in stamps]).reshape(-1, 3)
+    return Readings(topic.name, np.array(stamps, dtype=np.int64), ordered, frame_id, unusable)
 
 
-def headings(readings: Readings, mount: Pose2D) -> FloatArray:
-    """The robot's headings (N,) in rad by a compass that is mounted at ``mount``; north is the map's +y."""
-    return np.arctan2(readings.values[:, 0], readings.values[:, 1]) - mount.theta
+def headings(readings: Readings, rotation: FloatArray) -> FloatArray:
+    """The robot's headings (N,) in rad by a compass that is turned by ``rotation`` (3, 3); north is the map's +y."""
+    north = readings.values @ rotation.T
+    return np.arctan2(north[:, 0], north[:, 1])
 
 
 def flattened(places: FloatArray) -> FloatArray:
-    """Latitudes and longitudes (N, 2) in degrees as metres (N, 2) east and north of the first one.
+    """Latitudes and longitudes (N, 2 or more) in degrees as metres (N, 2) east and north of the first one.
 
     On the plane that touches the ellipsoid there: within ten kilometres distances are right to a centimetre.
     """
     squared = FLATTENING * (2 - FLATTENING)
-    latitude, longitude = np.radians(places).T
+    latitude, longitude = np.radians(places[:, :2]).T
     across = EQUATOR / np.sqrt(1 - squared * np.sin(latitude) ** 2)
     globe = np.column_stack(
         (

@@ -191,8 +191,27 @@ def test_a_robot_that_is_carried_away_is_found_again() -> None:
     truth, fixes = one.truth.copy(), one.fixes.copy()
     truth[300:, 0] += 5
     fixes[300:, 0] += 5
-    found = Fusion(replace(one, fixes=fixes).nodes(), TRUE_NOISE).filtered()
-    assert np.abs(found.poses[380:, :2] - truth[380:, :2]).max() < 0.4
+    fusion = Fusion(replace(one, fixes=fixes).nodes(), TRUE_NOISE)
+    assert np.abs(fusion.filtered().poses[380:, :2] - truth[380:, :2]).max() < 0.4
+    smoothed = fusion.smoothed().poses[:, :2]
+    assert np.abs(smoothed - truth[:, :2])[np.r_[:299, 321:600]].max() < 0.25  # the jump itself stays a jump
+
+
+def test_a_robot_whose_wheels_stand_still_is_not_believed_for_ever() -> None:
+    one = drive(11)
+    frozen = Trajectory(one.stamps, np.tile(one.odometry.poses[:1], (len(one.stamps), 1)))
+    found = Fusion(replace(one, odometry=frozen).nodes()).smoothed()
+    metres, _ = one.errors(found)
+    assert metres < 0.5 and found.used(0)[1] < 0.5 * len(one.stamps)
+    assert np.sqrt(found.covariances[:, 0, 0]).mean() > 0.02
+
+
+def test_the_noise_is_found_from_readings_between_the_scans(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("replay.fusion.MOST_NODES", 200)
+    one = drive(10)
+    between = one.stamps + SECOND // 20
+    nodes = nodes_at(between, one.odometry, (one.stamps, one.fixes), (one.stamps, one.headings))
+    assert Fusion(nodes).noise.fixes == pytest.approx(0.1, rel=0.15)
 
 
 def test_a_biased_compass_is_found_out() -> None:
@@ -233,7 +252,7 @@ def test_steps_lead_where_they_came_from(poses: FloatArray) -> None:
 @pytest.mark.parametrize("stride", [2, 7])
 def test_fewer_nodes_are_the_same_drive(stride: int) -> None:
     nodes = drive(9).nodes()
-    thin = nodes.thinned(stride)
+    thin = nodes.only(np.arange(0, len(nodes.stamps), stride))
     assert walk(thin.steps)[-1] == pytest.approx(walk(nodes.steps)[::stride][-1], abs=1e-9)
     assert thin.ways.sum() == pytest.approx(nodes.ways[: stride * (len(thin.ways) - 1) + 1].sum())
 

@@ -7,21 +7,33 @@ import numpy as np
 import pytest
 
 from prim.errors import LogReadError
-from prim.frames import Pose2D
+from prim.frames import Pose2D, wrap_angles
 from prim.log import LogReader
 from prim.messages import (
     FIX_TYPE,
     POINT_TYPE,
+    POSE_TYPE,
     VECTOR_TYPE,
     _header,
     _new,
     _serialize,
     encode_compass,
     encode_point,
+    encode_pose,
 )
 from replay.localize import FUSED, FuseOptions, Localizer
 from replay.sensors import find_compass, find_gps, flattened, headings, read_compass, read_gps
-from tests.replay.test_localize import DRIVE, SECOND, TIMES, Write, log_of, odometry, transforms, truth
+from tests.replay.test_localize import (
+    DRIVE,
+    SECOND,
+    TIMES,
+    Write,
+    log_of,
+    odometry,
+    raw_transform,
+    transforms,
+    truth,
+)
 
 WAY = [(1.0, 0.0), (1.5, 1.0), (2.0, 2.0)]
 """Seconds and x of a robot that drives along x."""
@@ -34,6 +46,14 @@ def points(topic: str, *fixes: tuple[float, float, float], frame: str = "map") -
         log.add_topic(topic, POINT_TYPE)
         for seconds, x, y in fixes:
             log.write(topic, round(seconds * SECOND), encode_point(round(seconds * SECOND), x, y, frame))
+
+    return write
+
+
+def goal(topic: str, x: float) -> Write:
+    def write(log) -> None:  # type: ignore[no-untyped-def]
+        log.add_topic(topic, POSE_TYPE)
+        log.write(topic, SECOND, encode_pose(SECOND, Pose2D(x, 0, 0)))
 
     return write
 
@@ -113,7 +133,7 @@ def test_auto_prefers_the_truth_and_a_tf_chain_to_map(tmp_path: Path) -> None:
 
 
 def test_auto_takes_no_clicked_point_for_a_gps(tmp_path: Path) -> None:
-    with log_of(tmp_path / "a.mcap", STRAIGHT, points("/clicked_point", (1.0, 3, 3))) as log:
+    with log_of(tmp_path / "a.mcap", STRAIGHT, points("/prefix/clicked_point", (1.0, 3, 3))) as log:
         assert Localizer(log).locate(TIMES).source == "odom"
 
 
@@ -156,9 +176,9 @@ def test_values_that_are_no_numbers_are_skipped_and_said(tmp_path: Path) -> None
         topic, other = find_gps(log), find_compass(log)
         assert topic is not None and other is not None
         gps = read_gps(log, topic)
-        assert gps is not None and len(gps.stamps) == 1
+        assert len(gps.stamps) == 1
         assert gps.notes == ("/gps: 2 messages without a usable value were skipped",)
-        assert read_compass(log, other) is None
+        assert len(read_compass(log, other).stamps) == 0
 
 
 def test_north_is_the_maps_y(tmp_path: Path) -> None:
@@ -167,9 +187,28 @@ def test_north_is_the_maps_y(tmp_path: Path) -> None:
         topic = find_compass(log)
         assert topic is not None
         read = read_compass(log, topic)
-        assert read is not None
-        assert headings(read, Pose2D()) == pytest.approx(turns)
-        assert headings(read, Pose2D(theta=0.5)) == pytest.approx(np.array(turns) - 0.5)
+        assert headings(read, np.eye(3)) == pytest.approx(turns)
+        quarter = np.array([[0, -1, 0], [1, 0, 0], [0, 0, 1]])
+        expected = wrap_angles(np.array(turns) - math.pi / 2)
+        assert wrap_angles(headings(read, quarter)) == pytest.approx(expected)
+
+
+def test_a_compass_may_hang_upside_down(tmp_path: Path) -> None:
+    turns = [0.3, 0.8, 1.2]
+    hung = raw_transform("base_link", "compass", (1.0, 0.0, 0.0, 0.0))
+
+    def mirrored(log) -> None:  # type: ignore[no-untyped-def]
+        log.add_topic("/compass", VECTOR_TYPE)
+        for (seconds, _), turn in zip(WAY, turns, strict=True):
+            stamp = round(seconds * SECOND)
+            north = _new("geometry_msgs/msg/Vector3", x=math.sin(turn), y=-math.cos(turn), z=0.0)
+            log.write(
+                "/compass", stamp, _serialize(_new(VECTOR_TYPE, header=_header(stamp, "compass"), vector=north))
+            )
+
+    spin = odometry("/odom", *((t, Pose2D(0, 0, turn)) for (t, _), turn in zip(WAY, turns, strict=True)))
+    with log_of(tmp_path / "a.mcap", hung, mirrored, spin) as log:
+        assert Localizer(log).locate(TIMES, FUSED).poses[:, 2] == pytest.approx(turns, abs=0.01)
 
 
 def test_satellite_fixes_become_metres_east_and_north(tmp_path: Path) -> None:
@@ -178,14 +217,31 @@ def test_satellite_fixes_become_metres_east_and_north(tmp_path: Path) -> None:
         topic = find_gps(log)
         assert topic is not None and topic.type == FIX_TYPE
         gps = read_gps(log, topic)
-        assert gps is not None
         assert gps.values == pytest.approx(np.array([[0, 0], [0, 10]]), abs=0.01)
 
 
 def test_satellite_messages_without_a_fix_are_skipped(tmp_path: Path) -> None:
     with log_of(tmp_path / "a.mcap", satellites("/fix", (1.0, 52.0, 13.0), status=-1)) as log:
         topic = find_gps(log)
-        assert topic is not None and read_gps(log, topic) is None
+        assert topic is not None and len(read_gps(log, topic).stamps) == 0
+
+
+def test_auto_falls_back_to_tf_and_says_why(tmp_path: Path) -> None:
+    moving = transforms("/tf", *((t, "odom", "laser", Pose2D(x, 0, 0)) for t, x in WAY))
+    indoors = satellites("/fix", (1.0, 52.0, 13.0), status=-1)
+    with log_of(tmp_path / "a.mcap", moving, indoors, COMPASS) as log:
+        found = Localizer(log).locate(TIMES)
+        assert found.source == "tf" and any(note.startswith("nothing is fused: ") for note in found.notes)
+    with log_of(tmp_path / "b.mcap", moving, GPS, goal("/goal_pose", 3.0)) as log:
+        assert Localizer(log).locate(TIMES).source == "tf"
+
+
+def test_what_a_gps_lost_is_said_though_nothing_is_left_of_it(tmp_path: Path) -> None:
+    with log_of(tmp_path / "a.mcap", STRAIGHT, points("/gps", (1.0, math.nan, 0)), COMPASS) as log:
+        found = Localizer(log).locate(TIMES, FUSED)
+        assert "/gps: 1 messages without a usable value were skipped" in found.notes
+        assert [sensor.name for sensor in found.sensors] == ["odom", "compass"]
+        assert "m" not in found.sensors[0].std  # nothing told how far off the odometry's place is
 
 
 def test_flattening_keeps_distances() -> None:
