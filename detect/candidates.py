@@ -24,7 +24,9 @@ WITHIN = 2.5
 """Others further away than this (m) are not reckoned with: few rays pass both, and say the same of all shapes."""
 
 OUT_OF_QUESTION = 30.0
-"""A kind whose evidence is this much (nats) less than the likeliest one's is not fitted again."""
+"""A kind whose evidence is this much (nats) less than the likeliest one's is not fitted again; with rays that are not
+independent, so much times their dispersion.
+"""
 
 MOVED, MOVED_SHARE = 0.05, 0.1
 """What stands behind has changed where more than such a share of rays ends elsewhere (m): all is fitted anew."""
@@ -103,7 +105,8 @@ def _fit_one(candidate: Candidate, beams: Beams, sensor: Sensor, anew: bool) -> 
         fits = again(candidate.fits, beams, sensor)
     possible = [fit for fit in fits if candidate.may_be(primitive_of(fit.kind, fit.p))]
     ordered = sorted(possible or fits, key=lambda fit: -laplace(fit))
-    likely = {fit.kind for fit in ordered if laplace(fit) > laplace(ordered[0]) - OUT_OF_QUESTION}
+    least = laplace(ordered[0]) - OUT_OF_QUESTION * sensor.dispersion
+    likely = {fit.kind for fit in ordered if laplace(fit) > least}
     candidate.fits = [fit for fit in ordered if fit.kind in likely | {SIMPLER.get(kind) for kind in likely}]
     candidate.fitted_to = sensor, beams
 

@@ -37,7 +37,7 @@ from detect.candidates import Candidate, fit_all, look_behind, share_of
 from detect.cells import MapCells
 from detect.detector import Detection, Detections, Rejection
 from detect.evidence import weighed
-from detect.measure import distance_to, first_noise, measured, measured_noise
+from detect.measure import CLEARLY, distance_to, first_noise, measured, measured_noise
 from detect.proposals import proposals
 from detect.raycost import MISS, STOP
 from mapping.grid import OccupancyGrid
@@ -257,7 +257,7 @@ def refine(
             if all(np.abs(parameters(one.now) - at).max() < SETTLED for one, at in zip(alone, where, strict=True)):
                 break
         sensor = measured(alone, sensor, noise_std)
-        fit_all(pool, alone, [False] * len(alone), sensor)
+        fit_all(pool, alone, [sensor.dispersion > CLEARLY] * len(alone), sensor)
         whole = [backdrop(one.beams, cells.occupied, cells.frame) for one in alone]
         refined = list(pool.map(lambda one, map_alone: finish(one, map_alone, sensor), alone, whole))
     made = {id(one): result for one, result in zip(alone, refined, strict=True)}
