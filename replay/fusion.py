@@ -316,8 +316,7 @@ class Fusion:
     def _estimate(self, stamps: Stamps, kept: Filtered, gains: FloatArray | None = None) -> Estimate:
         poses = kept.states.copy()
         poses[:, 2] = wrap_angles(poses[:, 2])
-        covariances = kept.covs[:, [0, 1, 2, 1, 3, 4, 2, 4, 5]].reshape(-1, 3, 3)
-        return Estimate(stamps, poses, covariances, self.noise, kept.verdicts, gains)
+        return Estimate(stamps, poses, matrices_of(kept.covs), self.noise, kept.verdicts, gains)
 
     def _run(
         self,
@@ -479,8 +478,13 @@ class Fusion:
 
 
 def six_of(matrices: FloatArray) -> FloatArray:
-    """The six numbers (N, 6) of symmetric matrices (N, 3, 3)."""
-    return matrices[:, [0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2]].copy()
+    """The six numbers (..., 6) of symmetric matrices (..., 3, 3)."""
+    return matrices[..., [0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2]].copy()
+
+
+def matrices_of(six: FloatArray) -> FloatArray:
+    """The symmetric matrices (..., 3, 3) of six numbers each (..., 6)."""
+    return six[..., [0, 1, 2, 1, 3, 4, 2, 4, 5]].reshape(*six.shape[:-1], 3, 3)
 
 
 def _off(noise: FloatArray, usual: FloatArray, unknown: list[int]) -> FloatArray:

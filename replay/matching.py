@@ -18,7 +18,7 @@ from mapping.matching import Beams, Likelihood, climb
 from prim.frames import Pose2D, Scan, Stamps, Trajectory, wrap_angles
 from prim.raycast import FloatArray
 from prim.world import Bounds
-from replay.fusion import Fusion, PoseNoise, nodes_at, six_of, steps_between
+from replay.fusion import Fusion, PoseNoise, matrices_of, nodes_at, six_of, steps_between
 from replay.kalman import LEAST_VARIANCE
 from replay.localize import LaserPoses, carried, compose
 from replay.scans import PosedScan
@@ -210,7 +210,7 @@ class Matcher:
         self, likelihood: Likelihood, beams: Beams, mount: FloatArray, prior: FloatArray, spread: FloatArray
     ) -> tuple[FloatArray, FloatArray]:
         """The likeliest pose by what was believed before (a pose, a covariance (6,)) and a scan; its covariance."""
-        believed = inverse_of(square(spread))
+        believed = inverse_of(matrices_of(spread))
         pose = prior.copy()
         widened = widening(SURE * math.sqrt(spread[0] + spread[3] + spread[5]), likelihood)
         while True:
@@ -224,7 +224,7 @@ class Matcher:
         off = pose - prior
         surprise = float(off @ believed @ off + np.trace(believed @ after)) / 3
         self._worse = min(max(self._worse * surprise**ADAPTS, 1.0), MOST_WORSE)
-        return pose, six_of(after[None])[0]
+        return pose, six_of(after)
 
     def _looks(self, likelihood: Likelihood, widened: float) -> tuple[float, FloatArray]:
         """Mean log-likelihood of a ray, and what each node's scans say about its pose (N, 12)."""
@@ -238,10 +238,10 @@ class Matcher:
             best, look = climb(likelihood, beams, mount, pose, pose, TRUST, widened)
             if look.rays >= LEAST_RAYS:
                 row = rows[node]
-                row[:3] += look.slope - square(row[3:9]) @ (
+                row[:3] += look.slope - matrices_of(row[3:9]) @ (
                     best - row[9:]
                 )  # another scan of this node looked elsewhere
-                row[3:9] += six_of(look.information[None])[0]
+                row[3:9] += six_of(look.information)
                 row[9:] = best
         return total / max(rays, 1), rows
 
@@ -249,7 +249,7 @@ class Matcher:
         """The laser's poses; as unsure as the smoother says, and as the map's own place is."""
         robot = self._robot[self._node]
         poses = compose(robot, self._mounts)
-        covariances = carried(np.array([square(six) for six in self._spread[self._node]]), robot, self._mounts)
+        covariances = carried(matrices_of(self._spread[self._node]), robot, self._mounts)
         covariances[:, [0, 1], [0, 1]] += (
             self._resolution**2 / 12
         )  # a map does not say where in its cells walls stand
@@ -312,8 +312,3 @@ def inverse_of(matrix: FloatArray) -> FloatArray:
     """The inverse in double precision."""
     inverse: FloatArray = np.linalg.inv(matrix).astype(float)
     return inverse
-
-
-def square(six: FloatArray) -> FloatArray:
-    """The symmetric matrix (3, 3) of its six numbers."""
-    return six[[0, 1, 2, 1, 3, 4, 2, 4, 5]].reshape(3, 3)
