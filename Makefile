@@ -7,7 +7,7 @@ NOISE_STD ?= 0.05
 
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
 
-.PHONY: demo test test-slow bench bench-maps bench-forward bench-refine lint format clean
+.PHONY: demo test test-slow bench bench-maps bench-forward bench-refine bench-poses lint format clean
 
 demo: .venv/installed
 	@mkdir -p demo
@@ -41,6 +41,10 @@ bench-refine: .venv/installed
 	$(BIN)/python -m bench.refine --update docs/refine.md --short README.md
 	$(BIN)/python -m bench.refine --conditions --sessions 40 --update docs/refine.md
 	$(BIN)/python -m bench.tracks --update docs/detect.md
+
+bench-poses: .venv/installed
+	$(BIN)/python -m bench.poses --sessions 12 --update docs/poses.md
+	$(BIN)/python -m bench.poses fusion --sessions 50 --update docs/poses.md
 
 lint: .venv/installed-dev
 	$(BIN)/ruff check .

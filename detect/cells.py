@@ -14,7 +14,7 @@ from detect.lines import Line, find_lines
 from mapping.grid import GridFrame, OccupancyGrid
 from prim.metrics import BoolGrid, dilate
 from prim.raycast import FloatArray
-from prim.shapes import Primitive
+from prim.shapes import Kind, Primitive
 
 LARGE = 0.75
 """What hangs together over more than this (m) is no primitive."""
@@ -205,7 +205,12 @@ def centres(chosen: BoolGrid, frame: GridFrame) -> FloatArray:
 
 def circumradius(primitive: Primitive) -> float:
     """How far (m) a primitive reaches from its centroid."""
-    return float(np.hypot(*primitive.local_outline(16).T).max())
+    width, height = primitive.width_height
+    if primitive.is_round:
+        return max(width, height)
+    if primitive.kind is Kind.TRIANGLE:
+        return max(2 / 3 * height, math.hypot(width / 2, height / 3))
+    return math.hypot(width, height) / 2
 
 
 def is_within(primitive: Primitive, points: NDArray[np.floating], margin: float) -> NDArray[np.bool_]:

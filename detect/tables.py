@@ -246,7 +246,7 @@ SHIPPED = """\
 # The shipped weights, measured
 
 Made by `prim-eval --suite shipped`; seeds and ways of recording stand in `detect/suite.py`: no network was trained or
-chosen on these sessions. F1, mAP 0.5 and mAP 0.5–0.95 are of boxes, as in [the paper's tables](paper.md); «found» is
+chosen on these sessions. F1, mAP 0.5 and mAP 0.5–0.95 are of boxes, as in the paper's tables; «found» is
 the F1 of the whole pipeline (kind right, outlines overlap by half), with the mean errors of what it finds (of angles
 the median)."""
 
