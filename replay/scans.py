@@ -123,6 +123,11 @@ class ScanLog:
                 f"scans are not deskewed: by their time_increment a sweep takes {self._told_sweep:.3g} s, where the "
                 f"time from one scan to the next allows {self._longest_sweep:.3g} s"
             )
+        return notes + self._oddities()
+
+    def _oddities(self) -> list[str]:
+        """Scans that were left out or have odd stamps."""
+        notes = []
         if self.unusable:
             index, problem = min(self.unusable.items())
             notes.append(f"{counted(len(self.unusable), 'scan')} cannot be used, the first one {index}: {problem}")
@@ -143,7 +148,7 @@ class ScanLog:
         return np.array(indices, dtype=np.intp), np.array(stamps, dtype=np.int64)
 
     def _none_usable(self) -> Scan:
-        reasons = "; ".join([*self.notes(), *self._log.lost])
+        reasons = "; ".join([*self._oddities(), *self._log.lost])
         raise LogReadError(self._log.path, f"no scan on {self.topic.name} can be used: {reasons}")
 
 

@@ -225,3 +225,20 @@ def test_ends_follow_corrected_poses(driven: Path) -> None:
         before, after = poses.ends - poses.poses, matched.ends - matched.poses
         assert np.hypot(*after[:, :2].T) == pytest.approx(np.hypot(*before[:, :2].T), abs=1e-9)
         assert wrap_angles(after[:, 2] - before[:, 2]) == pytest.approx(0, abs=1e-9)
+
+
+def test_a_sweep_that_cannot_be_is_not_believed(tmp_path: Path) -> None:
+    from prim.log import LogWriter
+    from prim.messages import SCAN_TYPE, encode_scan
+
+    path = tmp_path / "odd.mcap"
+    scan = replace(sweeping(Pose2D(), Pose2D()), time_increment=0.05)
+    with LogWriter(path) as log:
+        log.add_topic("/scan", SCAN_TYPE)
+        for k in range(4):
+            log.write("/scan", k * 10**8 + 10**9, encode_scan(replace(scan, stamp=k * 10**8 + 10**9)))
+    result = Pipeline(path, ReplayOptions(standing_still=True, detect=False)).run()
+    assert any(
+        note.startswith("scans are not deskewed: by their time_increment a sweep takes 8.95 s")
+        for note in result.notes
+    )

@@ -126,7 +126,7 @@ def test_a_scanner_that_stands_still(real_log: Find, in_tmp: Path, mapper: str) 
     arguments = [str(path), "--scan-topic", "/front_scan", "--standing-still", "--mapper", mapper, "--quiet"]
     assert console.run(app, "prim-replay", arguments) == 0
     report = json.loads(Path(f"hokuyo_two_scanners.{mapper}.report.json").read_text())
-    assert report["pose"] == {"source": "still", "rmse_m": None, "rmse_rad": None}
+    assert report["pose"]["source"] == "still" and report["pose"]["rmse_m"] is None
     assert report["log"]["scans_used"] == report["log"]["scans"] == 331
     assert report["map"]["scores"] is None
     options = ReplayOptions(mapper=mapper, scan_topic="/front_scan", standing_still=True)
