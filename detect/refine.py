@@ -118,18 +118,21 @@ def refine_detections(
     noise_std: float | None = None,
     threads: int = 2,
     before: Detections | None = None,
+    proposes: bool = True,
 ) -> tuple[Detections, float | None]:
     """Detections in ``grid`` refined by the scans that it was made of, and what was missed in it beside them.
 
     ``noise_std`` (m) is the range noise, where it is known; ``before``, what an earlier look at a growing map came
-    to: what was sure of its kind then is fitted on from there, which takes a fraction of the time. Returns what the
-    rays support, likeliest first, what they do not with the reasons, and the noise: None where no ray passes any.
+    to: what was sure of its kind then is fitted on from there, which takes a fraction of the time. What was missed is
+    only looked for without ``before``, and where one ``proposes``: maps of few scans are full of what might be one.
+    Returns what the rays support, likeliest first, what they do not with the reasons, and the noise: None where no
+    ray passes any.
     """
     cells = MapCells.of(grid)
     unsure = _gone(before, detections) if before else [one for one, _ in detections.doubtful]
     unsure = [one for one in unsure if not cells.hide(one.primitive)]
     guesses = [one.primitive for one in (*detections.found, *unsure)]
-    added = [_proposed(one) for one in proposals(cells, guesses)] if before is None else []
+    added = [_proposed(one) for one in proposals(cells, guesses)] if proposes and before is None else []
     wanted = (*detections.found, *unsure, *added)
     known = _known_before(wanted, before)
     starts = [known.get(number, one).primitive for number, one in enumerate(wanted)]

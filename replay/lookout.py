@@ -26,6 +26,9 @@ if TYPE_CHECKING:
 SCANS_ON_THE_WAY = 60
 """A look on the way is refined by so many of the scans to twice as many, evenly spread."""
 
+PROPOSED_FROM = 40
+"""On the way, what the networks missed is looked for when there are so many scans."""
+
 SHIPPED = Path(__file__).parents[1] / "detect" / "shipped"
 """The weights that come with prim: a folder for each mapper."""
 
@@ -141,7 +144,8 @@ class Lookout:
             self._searched_at = self._count
         before = None if anew else self._before
         some = [part for scan in self._scans for part in scan]
-        refined, noise_std = refine_detections(detections, some, grid, self._noise_std, cores(), before)
+        proposes = self._count >= PROPOSED_FROM
+        refined, noise_std = refine_detections(detections, some, grid, self._noise_std, cores(), before, proposes)
         self._before = refined
         return self._in_unsure_frame(refined), noise_std
 
