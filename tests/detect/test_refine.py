@@ -334,3 +334,31 @@ def test_reasons_name_the_limit() -> None:
     assert "in the map alone" in contradiction(replace(made, gain=100.0, misfit=2.0))
     assert "not known to within 20%" in contradiction(replace(made, gain=100.0, std={"side": 0.05}))
     assert contradiction(replace(made, gain=100.0)) == "" and "too large" in contradiction(None)
+
+
+def test_the_parts_of_a_scan_are_one_scan() -> None:
+    taken = scans(room(shape(Kind.SQUARE)), 0.0)
+    parts = []
+    for scan, pose in taken:
+        for first in range(0, 240, 60):
+            start = scan.angle_min + first * scan.angle_increment
+            part = replace(scan, angle_min=start, ranges=scan.ranges[first : first + 60], first_beam=first)
+            parts.append((part, pose))
+    whole, cut = (gather(of, [shape(Kind.SQUARE)], 0.05)[0][0] for of in (taken, parts))
+    assert cut.scan.tolist() == whole.scan.tolist()
+    assert cut.rays == pytest.approx(whole.rays)
+
+
+def test_poses_that_are_off_for_a_while_make_all_less_sure(monkeypatch: pytest.MonkeyPatch) -> None:
+    true = shape(Kind.RECTANGLE)
+    taken = scans(room(true), 0.02, stops=14)
+    drift = 0.012 * np.sin(np.arange(len(taken)) / 12)
+    moved = [
+        (scan, replace(pose, x=pose.x + off, y=pose.y - off)) for (scan, pose), off in zip(taken, drift, strict=True)
+    ]
+    cells = MapCells.of(mapped(moved))
+    (told,), _ = refine([true], moved, cells)
+    monkeypatch.setattr("detect.measure.STRETCHES", ())
+    (by_scans_alone,), _ = refine([true], moved, cells)
+    assert told is not None and by_scans_alone is not None
+    assert all(told.std[name] > 1.2 * by_scans_alone.std[name] for name in ("x", "y"))

@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -278,3 +279,14 @@ def test_the_gaussian_map_is_the_model_along_a_ray() -> None:
     found = row_at(grid, 0.005)
     assert found[within] == pytest.approx(gaussian_sensor_model(x[within] - 1.0, 0.1), abs=2e-3)
     assert (found[x > 1.45] == 0.5).all()
+
+
+@pytest.mark.parametrize(("first_beam", "state"), [(1, 1.0), (0, 0.0)])
+def test_the_end_points_of_a_scan_come_after_the_rays_of_all_its_parts(
+    make_scan: Callable[..., Scan], first_beam: int, state: float
+) -> None:
+    mapper = DeterministicMapper(0.02, (-1.0, -1.0, 1.0, 1.0))
+    mapper.update(make_scan(0.41), Pose2D(0.01, 0.01))
+    mapper.update(replace(make_scan(0.81), first_beam=first_beam), Pose2D(0.01, 0.01))
+    row = row_at(mapper.grid(), 0.01)
+    assert (row[71], row[91]) == (state, 1.0)

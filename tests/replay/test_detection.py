@@ -15,9 +15,10 @@ from mapping.grid import OccupancyGrid
 from mapping.mapper import MAPPERS
 from prim import console
 from prim.errors import UsageError
-from prim.shapes import Kind
+from prim.shapes import Kind, Primitive
 from recorder.session import Session
 from replay import cli
+from replay.lookout import spread_by_frame
 from replay.pipeline import Pipeline, ReplayOptions, ReplayResult
 from replay.report import report, table
 from replay.show import ViewerOptions
@@ -193,3 +194,12 @@ def test_nothing_is_held_against_the_truth_where_poses_are_in_no_known_frame(
 def test_the_gaussian_sensor_model_leaves_the_detector_its_own_map(noisy_session: Session, knowing: Knowing) -> None:
     replayed(noisy_session, mapper="prob", sensor_model="gaussian", noise_std=0.05, resolution=0.05)
     assert knowing.seen[0].frame.resolution == 0.01
+
+
+def test_a_map_whose_place_is_unsure_makes_places_and_angles_unsure() -> None:
+    primitive = Primitive(Kind.RECTANGLE, 3.0, -4.0, 0.2, (0.3, 0.2))
+    std = {"x": 0.003, "y": 0.0, "theta": 0.0, "width": 0.001, "height": 0.002}
+    shifted = spread_by_frame(primitive, std, np.diag([0.004**2, 0.0, 0.0]))
+    assert shifted == pytest.approx(std | {"x": 0.005})
+    turned = spread_by_frame(primitive, std, np.diag([0.0, 0.0, 0.001**2]))
+    assert turned == pytest.approx(std | {"x": 0.005, "y": 0.003, "theta": 0.001})  # 4 m and 3 m from the origin
