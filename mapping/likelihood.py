@@ -380,6 +380,26 @@ def follow(
     return kind, count, scale, gone, wildness, density
 
 
+@inline
+def stand(pose: Any, mount: Any, nudges: Any, k: int, corner: Any, per_metre: float, place: Any) -> None:
+    """Where a laser stands (in cells) and looks (cosine, sine) from a pose (``k`` = 0), or from one that is nudged up
+    or down along x, y or the heading (1 to 6).
+    """
+    x, y, theta = pose[0], pose[1], pose[2]
+    if k:
+        change = nudges[(k - 1) // 2] if k % 2 else -nudges[(k - 1) // 2]
+        if k < 3:
+            x += change
+        elif k < 5:
+            y += change
+        else:
+            theta += change
+    cos, sin = math.cos(theta), math.sin(theta)
+    place[0] = (x + cos * mount[0] - sin * mount[1] - corner[0]) * per_metre
+    place[1] = (y + sin * mount[0] + cos * mount[1] - corner[1]) * per_metre
+    place[2], place[3] = math.cos(theta + mount[2]), math.sin(theta + mount[2])
+
+
 @kernel
 def look(
     rays: Any,
@@ -414,19 +434,7 @@ def look(
     found[:] = 0.0
     looks = 7 if nudges[0] > 0 else 1
     for k in range(looks):
-        x, y, theta = pose[0], pose[1], pose[2]
-        if k:
-            change = nudges[(k - 1) // 2] if k % 2 else -nudges[(k - 1) // 2]
-            if k < 3:
-                x += change
-            elif k < 5:
-                y += change
-            else:
-                theta += change
-        cos, sin = math.cos(theta), math.sin(theta)
-        places[k, 0] = (x + cos * mount[0] - sin * mount[1] - corner[0]) * per_metre
-        places[k, 1] = (y + sin * mount[0] + cos * mount[1] - corner[1]) * per_metre
-        places[k, 2], places[k, 3] = math.cos(theta + mount[2]), math.sin(theta + mount[2])
+        stand(pose, mount, nudges, k, corner, per_metre, places[k])
     for i in range(len(rays)):
         here = 0.0
         counts = True
