@@ -76,10 +76,10 @@ def _nearest(beams: Beams, others: Sequence[Primitive]) -> FloatArray:
 
 def _walls(beams: Beams, walls: FloatArray) -> FloatArray:
     distance = beams.far.copy()
-    origins, scan = np.unique(beams.rays[:, :2], axis=0, return_inverse=True)
-    for number, origin in enumerate(origins.tolist()):
+    origins, scan = np.unique(beams.rays[:2], axis=1, return_inverse=True)
+    for number, origin in enumerate(origins.T.tolist()):
         own = np.flatnonzero(scan.ravel() == number)
-        cast = cast_segments((origin[0], origin[1]), beams.rays[own, 2:4], walls)
+        cast = cast_segments((origin[0], origin[1]), beams.rays[2:4, own].T, walls)
         distance[own] = np.minimum(distance[own], cast)
     return distance
 

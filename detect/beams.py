@@ -18,15 +18,18 @@ from detect.raycost import (
     MISS,
     NO_RETURN,
     RANGE,
+    ROWS,
     SAYS_NOTHING,
     STOP,
     TABLE_SPACING,
     TOO_NEAR,
     TRIANGLE,
+    clearances,
+    keep_passing,
     pass_by,
-    passing,
+    shade,
+    stop_at,
     tables,
-    trace,
     walk,
 )
 from mapping.forward import neighbour_noise
@@ -71,7 +74,7 @@ FAMILY = {
 
 @dataclass(frozen=True)
 class Beams:
-    """Rays that pass one primitive: ``rays`` (N, 7) as detect.raycost has them, ``kinds`` (N,), from where on (m)
+    """Rays that pass one primitive: ``rays`` (7, N) as detect.raycost has them, ``kinds`` (N,), from where on (m)
     they are ``near`` it (N,), each sensor's largest range ``far`` (N,), and the number of the ``scan`` (N,).
     """
 
@@ -82,7 +85,7 @@ class Beams:
     scan: NDArray[np.int32]
 
     def __len__(self) -> int:
-        return len(self.rays)
+        return len(self.kinds)
 
     def passing(self, primitive: Primitive, reach: float) -> NDArray[np.bool_]:
         """Which of them come within ``reach`` (m) of a primitive."""
@@ -92,20 +95,19 @@ class Beams:
 
     def much_alike(self, other: Beams) -> bool:
         """Whether all but a few of the same beams say much the same where they miss."""
-        differ = np.abs(self.rays[:, MISS] - other.rays[:, MISS]) > ALIKE_NATS
-        differ |= np.abs(np.minimum(self.rays[:, STOP], FAR) - np.minimum(other.rays[:, STOP], FAR)) > ALIKE_STOPS
+        differ = np.abs(self.rays[MISS] - other.rays[MISS]) > ALIKE_NATS
+        differ |= np.abs(np.minimum(self.rays[STOP], FAR) - np.minimum(other.rays[STOP], FAR)) > ALIKE_STOPS
         return bool(np.mean(differ) < ALIKE_SHARE)
 
-    @classmethod
-    def joined(cls, parts: Sequence[Beams]) -> Beams:
-        """All parts, one after the other."""
-        if not parts:
-            return cls(np.zeros((0, 7)), np.zeros(0, np.int8), np.zeros(0), np.zeros(0), np.zeros(0, np.int32))
-        return cls(*(np.concatenate([getattr(part, name) for part in parts]) for name in cls.__match_args__))
-
-    def of(self, chosen: NDArray[np.bool_]) -> Beams:
+    def of(self, chosen: NDArray[np.bool_] | slice) -> Beams:
         """Some of them."""
-        return Beams(*(getattr(self, name)[chosen] for name in self.__match_args__))
+        return Beams(
+            np.ascontiguousarray(self.rays[:, chosen]),
+            np.ascontiguousarray(self.kinds[chosen]),
+            self.near[chosen],
+            self.far[chosen],
+            self.scan[chosen],
+        )
 
 
 @dataclass(frozen=True)
@@ -142,14 +144,53 @@ def parameters(primitive: Primitive) -> FloatArray:
     return np.array([primitive.x, primitive.y, primitive.theta or 0.0, *primitive.width_height])
 
 
+class Kept:
+    """The rays that pass one circle, as they come in: room for more is made where it is needed."""
+
+    def __init__(self) -> None:
+        self.size, self.stride = 0, 1
+        self._made(1024)
+
+    def _made(self, room: int) -> None:
+        self.numbers = np.zeros((ROWS, room))
+        self.kinds, self.scan = np.zeros(room, np.int8), np.zeros(room, np.int32)
+
+    def make_room(self, more: int) -> None:
+        """Makes room for so many more."""
+        if self.size + more > len(self.kinds):
+            self._hold(np.arange(self.size), 2 * (self.size + more))
+
+    def thin(self) -> None:
+        """Leaves out every other scan where there are too many rays."""
+        if self.size > 2 * MOST:
+            self.stride *= 2
+            self._hold(np.flatnonzero(self.scan[: self.size] % self.stride == 0), len(self.kinds))
+
+    def _hold(self, chosen: NDArray[np.intp], room: int) -> None:
+        numbers, kinds, scan = self.numbers, self.kinds, self.scan
+        self._made(room)
+        self.size = len(chosen)
+        self.numbers[:, : self.size] = numbers[:, chosen]
+        self.kinds[: self.size], self.scan[: self.size] = kinds[chosen], scan[chosen]
+
+    def beams(self) -> Beams:
+        """All that are kept."""
+        numbers = self.numbers[:, : self.size].copy()
+        return Beams(
+            numbers[: len(numbers) - 2],
+            self.kinds[: self.size].copy(),
+            numbers[-2],
+            numbers[-1],
+            self.scan[: self.size].copy(),
+        )
+
+
 class Gatherer:
     """Collects the rays that pass each of some circles: ``centres`` (M, 2) and ``reach`` (M,) in metres."""
 
     def __init__(self, centres: FloatArray, reach: FloatArray) -> None:
         self._centres, self._reach = centres, reach
-        self._kept: list[list[Beams]] = [[] for _ in reach]
-        self._size = [0] * len(reach)
-        self._stride = [1] * len(reach)
+        self._kept = [Kept() for _ in reach]
         self._count = 0
         self.span = 0.0
         self._ranges: list[NDArray[np.float32]] = []
@@ -163,51 +204,29 @@ class Gatherer:
         near = np.flatnonzero(away - self._reach < scan.range_max)
         if not len(near):
             return
-        self.span = max(self.span, min(scan.range_max, FARTHEST) - scan.range_min)
+        far = min(scan.range_max, FARTHEST)
+        self.span = max(self.span, far - scan.range_min)
         kinds, z = _measurements(scan)
-        chosen = np.empty(len(z), np.int64)
-        cos, sin = math.cos(pose.theta), math.sin(pose.theta)
         for k in near.tolist():
-            if self._count % self._stride[k]:
+            kept = self._kept[k]
+            if self._count % kept.stride:
                 continue
-            towards = self._centres[k] - (pose.x, pose.y)
-            x, y = towards.tolist()
-            count = passing(scan.directions, cos, sin, x, y, self._reach[k], kinds, chosen)
-            if count:
-                self._keep(k, self._beams(scan, pose, kinds, z, chosen[:count], towards, self._reach[k]))
-
-    def _beams(
-        self,
-        scan: Scan,
-        pose: Pose2D,
-        kinds: NDArray[np.int8],
-        z: FloatArray,
-        chosen: NDArray[np.int64],
-        towards: FloatArray,
-        reach: float,
-    ) -> Beams:
-        """Some of a scan's rays."""
-        cos, sin = math.cos(pose.theta), math.sin(pose.theta)
-        directions = scan.directions[chosen] @ np.array([[cos, sin], [-sin, cos]])
-        rays = np.zeros((len(chosen), 7))
-        rays[:, :2] = pose.x, pose.y
-        rays[:, 2:4] = directions
-        rays[:, RANGE] = z[chosen]
-        far, number = np.full(len(chosen), min(scan.range_max, FARTHEST)), np.full(len(chosen), self._count, np.int32)
-        return Beams(rays, kinds[chosen], directions @ towards - reach, far, number)
-
-    def _keep(self, k: int, beams: Beams) -> None:
-        """Keeps one scan's rays for a circle; leaves out every other scan where they become too many."""
-        kept = self._kept[k]
-        if kept and kept[-1].scan[0] == beams.scan[0]:
-            kept[-1] = Beams.joined((kept[-1], beams))
-        else:
-            kept.append(beams)
-        self._size[k] += len(beams)
-        if self._size[k] > 2 * MOST:
-            self._kept[k] = self._kept[k][::2]
-            self._size[k] = sum(len(one) for one in self._kept[k])
-            self._stride[k] *= 2
+            kept.make_room(len(z))
+            x, y = self._centres[k].tolist()
+            kept.size = keep_passing(
+                scan.directions,
+                kinds,
+                z,
+                (pose.x, pose.y, pose.theta),
+                (x, y, self._reach[k]),
+                (far, self._count),
+                kept.numbers,
+                kept.kinds,
+                kept.scan,
+                kept.size,
+            )
+            if not scan.first_beam:
+                kept.thin()
 
     @property
     def most_noise(self) -> float:
@@ -217,7 +236,7 @@ class Gatherer:
 
     def beams(self) -> list[Beams]:
         """Each circle's rays."""
-        return [Beams.joined(kept) for kept in self._kept]
+        return [kept.beams() for kept in self._kept]
 
 
 def _measurements(scan: Scan) -> tuple[NDArray[np.int8], FloatArray]:
@@ -260,10 +279,26 @@ class Backdrop:
         return Backdrop(self.stops[chosen], self.ends[chosen], self.blocked[chosen], self.spread)
 
 
-def backdrop(beams: Beams, occupied: NDArray[np.bool_], frame: GridFrame) -> Backdrop:
+@dataclass(frozen=True)
+class Obstacles:
+    """How far (cells) it is in a map to what is occupied: ``clear`` (rows, cols), and where that lies."""
+
+    clear: NDArray[np.uint8]
+    frame: GridFrame
+
+    @classmethod
+    def of(cls, occupied: NDArray[np.bool_], frame: GridFrame) -> Obstacles:
+        """Of a map's occupied cells (rows, cols)."""
+        clear = np.empty(occupied.shape, np.uint8)
+        clearances(occupied, clear)
+        return cls(clear, frame)
+
+
+def backdrop(beams: Beams, obstacles: Obstacles) -> Backdrop:
     """What stands behind a primitive whose cells are cleared; a cell tells it to within a cell."""
     stops, ends = np.zeros(len(beams)), np.zeros(len(beams), np.bool_)
-    walk(occupied, frame.row, frame.col, 1 / frame.resolution, beams.rays, beams.far, stops, ends)
+    frame = obstacles.frame
+    walk(obstacles.clear, frame.row, frame.col, 1 / frame.resolution, beams.rays, beams.far, stops, ends)
     return Backdrop(stops, ends, ends & (stops < beams.near), 0.5 * frame.resolution)
 
 
@@ -278,25 +313,12 @@ def before(beams: Beams, behind: Backdrop, by_map: FloatArray, others: Sequence[
     ``by_map`` (N,) is what :func:`map_says`.
     """
     rays = beams.rays.copy()
-    nearest = np.full(len(beams), FAR)
+    rays[STOP] = FAR
+    rays[MISS] = by_map
     for other in others:
-        _shorten(nearest, beams, other)
-    first = np.flatnonzero(nearest < behind.stops)
-    rays[:, STOP] = np.where(behind.blocked, 0.0, nearest)
-    rays[:, MISS] = by_map
-    x = (nearest[first] - beams.rays[first, RANGE]) / sensor.std
-    rays[first, MISS] = in_table(sensor.table, beams.kinds[first], x)
+        stop_at(FAMILY[other.kind], parameters(other), circumradius(other), rays)
+    shade(rays, beams.kinds, behind.stops, behind.blocked, sensor.std, sensor.table)
     return replace(beams, rays=rays)
-
-
-def _shorten(nearest: FloatArray, beams: Beams, other: Primitive) -> None:
-    """Cuts distances (N,) of beams down to where another primitive stops them."""
-    x, y = other.x - beams.rays[:, 0], other.y - beams.rays[:, 1]
-    aside = np.abs(x * beams.rays[:, 3] - y * beams.rays[:, 2])
-    near = np.flatnonzero(aside < circumradius(other))
-    distance = np.empty(len(near))
-    trace(FAMILY[other.kind], parameters(other), beams.rays[near], distance)
-    nearest[near] = np.minimum(nearest[near], distance)
 
 
 def in_table(table: FloatArray, kinds: NDArray[np.int8], x: FloatArray) -> FloatArray:
@@ -311,7 +333,7 @@ def explained(beams: Beams, stops: FloatArray, ends: NDArray[np.bool_], spread: 
 
     A stop is known to within ``spread`` (m). A ray that leaves the map ends anywhere beyond, or nowhere.
     """
-    z, kinds = beams.rays[:, RANGE], beams.kinds
+    z, kinds = beams.rays[RANGE], beams.kinds
     even = _peak_share(sensor.std, sensor.span)
     wide = math.hypot(sensor.std, spread)
     at_stop = np.exp(in_table(sensor.table, kinds, (stops - z) / wide))

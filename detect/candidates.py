@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from detect.beams import Backdrop, Beams, Sensor, backdrop, before, map_says, parameters
+from detect.beams import Backdrop, Beams, Obstacles, Sensor, backdrop, before, map_says, parameters
 from detect.cells import MapCells, circumradius
 from detect.detector import Detection
 from detect.evidence import laplace
@@ -116,7 +116,7 @@ def _much_alike(one: Sensor, other: Sensor) -> bool:
     return abs(one.std - other.std) < SAME_NOISE * other.std and one.footprint == other.footprint
 
 
-def look_behind(candidates: Sequence[Candidate], cells: MapCells, margin: float) -> list[bool]:
+def look_behind(pool: Executor, candidates: Sequence[Candidate], cells: MapCells, margin: float) -> list[bool]:
     """Reads from the map what stands behind each candidate: the map without their own cells.
 
     Whose cells are a candidate's is better known the second time; returns for which that changed much.
@@ -126,12 +126,13 @@ def look_behind(candidates: Sequence[Candidate], cells: MapCells, margin: float)
     walls = walls_behind(cells, shapes, [one.start for one in candidates])
     for wall in walls:
         occupied[wall.cells] = False
+    obstacles = Obstacles.of(occupied, cells.frame)
+    behind = pool.map(lambda one: backdrop(one.beams, obstacles), candidates)
     changed = []
-    for one in candidates:
-        before = one.map_behind
-        one.map_behind = backdrop(one.beams, occupied, cells.frame)
+    for one, now in zip(candidates, behind, strict=True):
+        before, one.map_behind = one.map_behind, now
         one.walls = [wall for wall in walls if apart(wall.stretch, one.start) < WITHIN]
-        moved = before is None or np.mean(np.abs(before.stops - one.map_behind.stops) > MOVED) > MOVED_SHARE
+        moved = before is None or np.mean(np.abs(before.stops - now.stops) > MOVED) > MOVED_SHARE
         changed.append(bool(moved))
     return changed
 

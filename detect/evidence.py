@@ -138,19 +138,19 @@ class Split:
         margins(FAMILY[fit.kind], fit.p, covariance, beams.rays, sensor.footprint, sure)
         hit, missed = sure > 1, sure < -1
         gradient, information = np.zeros(PARAMETERS), np.zeros((PARAMETERS, PARAMETERS))
+        surely = beams.of(hit)
         constant = slopes(
             FAMILY[fit.kind],
             fit.p,
-            beams.rays[hit],
-            beams.kinds[hit],
-            1,
+            surely.rays,
+            surely.kinds,
             sensor.std,
             sensor.table,
             1e-9,
             gradient,
             information,
         )
-        constant -= float(beams.rays[missed, MISS].sum())
+        constant -= float(beams.rays[MISS, missed].sum())
         return cls(fit, constant, gradient, information, beams.of(~hit & ~missed), sensor)
 
     def costs(self, shapes: FloatArray) -> FloatArray:

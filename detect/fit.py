@@ -49,6 +49,20 @@ class Fit:
     information: FloatArray
 
 
+@dataclass(frozen=True)
+class Share:
+    """Some beams, ``each`` of which stands for so many."""
+
+    beams: Beams
+    each: int = 1
+
+    @classmethod
+    def of(cls, beams: Beams, about: int) -> Share:
+        """About so many of the beams, evenly spread."""
+        each = max(1, len(beams) // about)
+        return cls(beams.of(slice(None, None, each)), each) if each > 1 else cls(beams)
+
+
 def _ties() -> dict[Kind, FloatArray]:
     """For each kind the matrix (5, K) from its own parameters to x, y, theta, width, height."""
     full = np.eye(PARAMETERS)
@@ -109,15 +123,15 @@ def search(now: Primitive, beams: Beams, sensor: Sensor) -> list[Fit]:
     Starts are fitted to some of the rays, and held against all of them, beside what it was taken for ``now``; from
     the best of each kind the fit goes on with more rays.
     """
-    step = max(1, len(beams) // COARSE_RAYS)
-    tried = {kind: [_coarse(kind, p, beams, sensor, step).p for p in starts(now, kind)] for kind in Kind}
+    few = Share.of(beams, COARSE_RAYS)
+    tried = {kind: [_coarse(kind, p, few, sensor).p for p in starts(now, kind)] for kind in Kind}
     tried[now.kind].append(parameters(now))
     ranked = {kind: _ranked(kind, ways, beams, sensor) for kind, ways in tried.items()}
     limit = min(ways[0][0] for ways in ranked.values()) + HOPELESS
     hopeful = {kind for kind, ways in ranked.items() if ways[0][0] < limit}
     hopeful |= {simple for kind, simple in SIMPLER.items() if kind in hopeful}
-    step = max(1, len(beams) // SEARCH_RAYS)
-    return [_fine(kind, _best_ways(ranked[kind]), beams, sensor, step) for kind in Kind if kind in hopeful]
+    some = Share.of(beams, SEARCH_RAYS)
+    return [_fine(kind, _best_ways(ranked[kind]), some, sensor) for kind in Kind if kind in hopeful]
 
 
 def _best_ways(ranked: Sequence[tuple[float, FloatArray]]) -> list[FloatArray]:
@@ -125,9 +139,9 @@ def _best_ways(ranked: Sequence[tuple[float, FloatArray]]) -> list[FloatArray]:
     return [p for cost, p in ranked if cost < ranked[0][0] + HOPELESS_WAY][:WAYS]
 
 
-def _coarse(kind: Kind, p: FloatArray, beams: Beams, sensor: Sensor, step: int) -> Fit:
-    """A fit to every ``step``-th beam."""
-    return _fit(kind, p, beams, sensor, COARSE_BLURS, COARSE_STEPS, step, ROUGH)
+def _coarse(kind: Kind, p: FloatArray, share: Share, sensor: Sensor) -> Fit:
+    """A fit that only tells what to go on with."""
+    return _fit(kind, p, share, sensor, COARSE_BLURS, COARSE_STEPS, ROUGH)
 
 
 def _ranked(kind: Kind, ways: Sequence[FloatArray], beams: Beams, sensor: Sensor) -> list[tuple[float, FloatArray]]:
@@ -139,15 +153,15 @@ def _ranked(kind: Kind, ways: Sequence[FloatArray], beams: Beams, sensor: Sensor
 
 def again(fits: Sequence[Fit], beams: Beams, sensor: Sensor) -> list[Fit]:
     """Kinds fitted again, from where they are."""
-    return [_fine(fit.kind, [fit.p], beams, sensor) for fit in fits]
+    return [_fine(fit.kind, [fit.p], Share(beams), sensor) for fit in fits]
 
 
-def _fine(kind: Kind, ways: Sequence[FloatArray], beams: Beams, sensor: Sensor, step: int = 1) -> Fit:
+def _fine(kind: Kind, ways: Sequence[FloatArray], share: Share, sensor: Sensor) -> Fit:
     """The best fit from some ``ways``; a triangle's also with the other two corners as its apex."""
-    best = min((_fit(kind, p, beams, sensor, FINE_BLURS, FINE_STEPS, step) for p in ways), key=lambda fit: fit.cost)
+    best = min((_fit(kind, p, share, sensor, FINE_BLURS, FINE_STEPS) for p in ways), key=lambda fit: fit.cost)
     if kind is not Kind.TRIANGLE:
         return best
-    others = [_fit(kind, p, beams, sensor, FINE_BLURS, FINE_STEPS, step) for p in other_apexes(best.p)]
+    others = [_fit(kind, p, share, sensor, FINE_BLURS, FINE_STEPS) for p in other_apexes(best.p)]
     return min([best, *others], key=lambda fit: fit.cost)
 
 
@@ -169,31 +183,29 @@ def other_apexes(p: FloatArray) -> list[FloatArray]:
 def _fit(
     kind: Kind,
     p: FloatArray,
-    beams: Beams,
+    share: Share,
     sensor: Sensor,
     blurs: Sequence[float],
     steps: int,
-    step: int = 1,
     tolerance: float = TOLERANCE,
 ) -> Fit:
-    """The nearest best fit of a kind."""
+    """The nearest best fit of a kind to some of the beams; its cost and information as all would make them."""
     tie = TIES[kind]
     found, information = p.copy(), np.zeros((tie.shape[1], tie.shape[1]))
     cost = descend(
         FAMILY[kind],
         found,
         tie,
-        beams.rays,
-        beams.kinds,
-        step,
+        share.beams.rays,
+        share.beams.kinds,
         sensor.std,
         sensor.table,
         np.maximum(blurs, sensor.footprint),
         steps,
-        tolerance,
+        tolerance / share.each,
         information,
     )
-    return Fit(kind, found, cost, information)
+    return Fit(kind, found, share.each * cost, share.each * information)
 
 
 def primitive_of(kind: Kind, p: FloatArray) -> Primitive:

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from mapping.rays import kernel
 from prim.raycast import FloatArray
 
 Line = tuple[float, float, float]
@@ -39,13 +41,31 @@ def find_lines(points: FloatArray, resolution: float, least_length: float, most:
 
 def _most_on_a_line(points: FloatArray, resolution: float, rng: np.random.Generator) -> NDArray[np.bool_]:
     """Which points lie within a cell of the line through two of them that has most."""
-    best = np.zeros(len(points), np.bool_)
-    for first, second in rng.integers(len(points), size=(TRIALS, 2)):
-        along = points[second] - points[first]
-        length = math.hypot(*along)
+    pairs = rng.integers(len(points), size=(TRIALS, 2))
+    best = pairs[best_pair(np.ascontiguousarray(points.T), pairs, resolution)]
+    first, second = points[best]
+    along = second - first
+    return np.asarray(np.abs((points - first) @ (-along[1], along[0])) < resolution * math.hypot(*along))
+
+
+@kernel
+def best_pair(points: Any, pairs: Any, resolution: float) -> int:
+    """Which pair (T, 2) of points (2, N) has the line with most within a cell; pairs less than 8 cells apart have none.
+
+    The first where there are several.
+    """
+    best, most = 0, 0
+    for k in range(len(pairs)):
+        first, second = pairs[k]
+        x, y = points[0, first], points[1, first]
+        nx, ny = y - points[1, second], points[0, second] - x
+        length = math.sqrt(nx * nx + ny * ny)
         if length < 8 * resolution:
             continue
-        off = np.abs((points - points[first]) @ np.array([-along[1], along[0]])) / length
-        if np.count_nonzero(off < resolution) > np.count_nonzero(best):
-            best = off < resolution
+        nx, ny = nx / length, ny / length
+        d, count = nx * x + ny * y, 0
+        for i in range(points.shape[1]):
+            count += abs(nx * points[0, i] + ny * points[1, i] - d) < resolution
+        if count > most:
+            best, most = k, count
     return best

@@ -61,7 +61,7 @@ def _residuals(beams: Beams, primitive: Primitive) -> FloatArray:
     """How far (m) measured ranges are from a primitive that their rays meet."""
     distance = distance_to(primitive, beams)
     hit = (distance < beams.far) & (beams.kinds == MEASURED)
-    return np.asarray(beams.rays[hit, RANGE] - distance[hit])
+    return np.asarray(beams.rays[RANGE, hit] - distance[hit])
 
 
 def measured(candidates: Sequence[Candidate], sensor: Sensor, noise_std: float | None) -> Sensor:
@@ -93,8 +93,8 @@ def measured_dispersion(candidates: Sequence[Candidate], sensor: Sensor) -> floa
     for one in candidates:
         beams = one.seen_before(candidates, sensor)
         distance = distance_to(one.now, beams)
-        error = (beams.rays[:, RANGE] - distance) / sensor.std
-        clear = (distance < beams.rays[:, STOP]) & (beams.kinds == MEASURED) & (np.abs(error) < CLEAR_ERROR)
+        error = (beams.rays[RANGE] - distance) / sensor.std
+        clear = (distance < beams.rays[STOP]) & (beams.kinds == MEASURED) & (np.abs(error) < CLEAR_ERROR)
         error = _without_cut(error, np.minimum((beams.far - sensor.span - distance) / sensor.std, 0.0))
         count = np.bincount(beams.scan[clear])
         total = np.bincount(beams.scan[clear], error[clear])
@@ -143,7 +143,7 @@ def _scores(candidate: Candidate, beams: Beams, sensor: Sensor) -> FloatArray | 
     def told(some: Beams) -> tuple[FloatArray, FloatArray]:
         gradient, information = np.zeros(PARAMETERS), np.zeros((PARAMETERS, PARAMETERS))
         shape = FAMILY[fit.kind], fit.p
-        slopes(*shape, some.rays, some.kinds, 1, sensor.std, sensor.table, blur, gradient, information)
+        slopes(*shape, some.rays, some.kinds, sensor.std, sensor.table, blur, gradient, information)
         return tie.T @ gradient, tie.T @ information @ tie
 
     try:
@@ -190,8 +190,8 @@ def noise_of(met: Sequence[tuple[FloatArray, NDArray[np.int8], FloatArray]], sen
 def _met(candidate: Candidate, beams: Beams) -> tuple[FloatArray, NDArray[np.int8], FloatArray]:
     """Where (m) beams meet a candidate, what they measured (kind), and the range or its limit (m)."""
     distance = distance_to(candidate.now, beams)
-    meets = (distance < beams.rays[:, STOP]) & (distance < beams.far)
-    return distance[meets], beams.kinds[meets], beams.rays[meets, RANGE]
+    meets = (distance < beams.rays[STOP]) & (distance < beams.far)
+    return distance[meets], beams.kinds[meets], beams.rays[RANGE, meets]
 
 
 def _least(cost: Callable[[float], float], at: float, step: float = 0.5) -> float:

@@ -34,10 +34,17 @@ X, Y, THETA, WIDTH, HEIGHT = range(5)
 PARAMETERS = 5
 
 ORIGIN_X, ORIGIN_Y, DIRECTION_X, DIRECTION_Y, RANGE, STOP, MISS = range(7)
-"""Columns of beams (N, 7): the ray; the measured range, or the limit it is beyond; from where on (m) something else
+"""Rows of beams (7, N): the ray; the measured range, or the limit it is beyond; from where on (m) something else
 stops it; the logarithm of its likelihood if it misses the shape."""
 
+NEAR, FARTHEST = 7, 8
+ROWS = 9
+"""Rows that beams have besides while they are collected: from where on (m) they are near, the largest range (m)."""
+
 MEASURED, TOO_NEAR, NO_RETURN, SAYS_NOTHING = 0, 1, 2, 3
+
+BLOCK = 256
+"""So many rays are held against a shape at once."""
 
 TABLE_REACH = 12.0
 TABLE_SPACING = 64
@@ -167,14 +174,14 @@ def slide(sign: float, ax: float, ay: float, bx: float, by: float, width: float,
 
 @inline
 def told_by(
-    family: int, p: Any, cos: float, sin: float, beam: Any, blur: float, dr: Any, ds: Any
+    family: int, p: Any, cos: float, sin: float, beams: Any, i: int, blur: float, dr: Any, ds: Any
 ) -> tuple[float, float]:
-    """Where a ray meets a shape (r) and by how much it hits it (s), both in metres, with derivatives by p.
+    """Where ray ``i`` meets a shape (r) and by how much it hits it (s), both in metres, with derivatives by p.
 
     Where s is below -blur nothing else is set. A ray that misses by less has the r of the silhouette's point.
     """
-    dx, dy = beam[DIRECTION_X], beam[DIRECTION_Y]
-    ox, oy = beam[ORIGIN_X] - p[X], beam[ORIGIN_Y] - p[Y]
+    dx, dy = beams[DIRECTION_X, i], beams[DIRECTION_Y, i]
+    ox, oy = beams[ORIGIN_X, i] - p[X], beams[ORIGIN_Y, i] - p[Y]
     width, height = p[WIDTH], p[HEIGHT]
     nx, ny = -dy, dx
     ax, ay = cos * nx + sin * ny, cos * ny - sin * nx
@@ -219,6 +226,107 @@ def told_by(
 
 
 @inline
+def meet(family: int, p: Any, beams: Any, first: int, count: int, r: Any, s: Any) -> None:
+    """As :func:`told_by` of ``count`` rays from the ``first`` on, without derivatives: several rays at once.
+
+    s is -FAR where the shape lies behind a ray. There are no branches here, so that compilers can use vectors.
+    """
+    cos, sin = math.cos(p[THETA]), math.sin(p[THETA])
+    x, y, width, height = p[X], p[Y], p[WIDTH], p[HEIGHT]
+    to_x, to_y = 1.0 / width, 1.0 / height
+    origin_x, origin_y = beams[ORIGIN_X, first : first + count], beams[ORIGIN_Y, first : first + count]
+    towards_x, towards_y = beams[DIRECTION_X, first : first + count], beams[DIRECTION_Y, first : first + count]
+    for i in range(count):
+        dx, dy = towards_x[i], towards_y[i]
+        ox, oy = origin_x[i] - x, origin_y[i] - y
+        bx, by = cos * dx + sin * dy, cos * dy - sin * dx
+        lx, ly, ux, uy = (cos * ox + sin * oy) * to_x, (cos * oy - sin * ox) * to_y, bx * to_x, by * to_y
+        mx, my = -width * by, height * bx
+        offset = oy * dx - ox * dy
+        ahead = -(ox * dx + oy * dy)
+        if family == BOX:
+            side = 1.0 if offset >= 0.0 else -1.0
+            beside = 0.5 * (abs(mx) + abs(my)) - abs(offset)
+            qx, qy = (side if mx >= 0.0 else -side), (side if my >= 0.0 else -side)
+            past = ahead + 0.5 * (width * qx * bx + height * qy * by)
+            along = 1.0 / ux if ux != 0.0 else ENDLESS
+            across = 1.0 / uy if uy != 0.0 else ENDLESS
+            enter = max(-0.5 * abs(along) - lx * along, -0.5 * abs(across) - ly * across)
+            leave = min(0.5 * abs(along) - lx * along, 0.5 * abs(across) - ly * across)
+        elif family == DISC:
+            side = 1.0 if offset >= 0.0 else -1.0
+            length = math.sqrt(mx * mx + my * my)
+            beside = length - abs(offset)
+            past = ahead + side * (width * mx * bx + height * my * by) / length
+            square, half = ux * ux + uy * uy, ux * lx + uy * ly
+            root = math.sqrt(max(half * half - square * (lx * lx + ly * ly - 1.0), 0.0))
+            enter, leave = (-half - root) / square, (root - half) / square
+        else:
+            left, right, top = -0.5 * mx - my / 3.0, 0.5 * mx - my / 3.0, 2.0 * my / 3.0
+            above, below = max(left, right, top) - offset, offset - min(left, right, top)
+            beside = min(above, below)
+            side = -1.0 if below < above else 1.0
+            most = max(side * left, side * right, side * top)
+            at_left = -0.5 * width * bx - height * by / 3.0
+            at_right = 0.5 * width * bx - height * by / 3.0
+            at_top = 2.0 * height * by / 3.0
+            past = ahead + (at_top if side * top >= most else (at_right if side * right >= most else at_left))
+            enter, leave = -FAR, FAR
+            for edge in range(3):
+                ex, ey = EDGE_X[edge], EDGE_Y[edge]
+                into = ex * ux + ey * uy
+                crossing = (EDGE_AT[edge] - ex * lx - ey * ly) / (into if into != 0.0 else 1.0)
+                enter = max(enter, crossing if into < 0.0 else -FAR)
+                leave = min(leave, crossing if into > 0.0 else FAR)
+        hits = beside > 0.0
+        r[i] = enter if hits else past
+        s[i] = -FAR if hits and leave < 0.0 else beside
+
+
+@inline
+def turn_with(family: int, p: Any, rays: Any, count: int, dr: Any) -> None:
+    """The derivatives ``dr`` (5, count) by p of the distances to a shape that all ``rays`` (4, count) hit.
+
+    As the outline moves along its normal, so does the point where a ray enters it, along the ray.
+    """
+    cos, sin = math.cos(p[THETA]), math.sin(p[THETA])
+    x, y, width, height = p[X], p[Y], p[WIDTH], p[HEIGHT]
+    to_x, to_y = 1.0 / width, 1.0 / height
+    for i in range(count):
+        dx, dy = rays[DIRECTION_X, i], rays[DIRECTION_Y, i]
+        ox, oy = rays[ORIGIN_X, i] - x, rays[ORIGIN_Y, i] - y
+        lx, ly = (cos * ox + sin * oy) * to_x, (cos * oy - sin * ox) * to_y
+        ux, uy = (cos * dx + sin * dy) * to_x, (cos * dy - sin * dx) * to_y
+        if family == BOX:
+            along = 1.0 / ux if ux != 0.0 else ENDLESS
+            across = 1.0 / uy if uy != 0.0 else ENDLESS
+            near_x, near_y = -0.5 * abs(along) - lx * along, -0.5 * abs(across) - ly * across
+            by_x = near_x > near_y
+            enter = max(near_x, near_y)
+            gx = (-1.0 if ux > 0.0 else 1.0) if by_x else 0.0
+            gy = 0.0 if by_x else (-1.0 if uy > 0.0 else 1.0)
+        elif family == DISC:
+            square, half = ux * ux + uy * uy, ux * lx + uy * ly
+            root = math.sqrt(max(half * half - square * (lx * lx + ly * ly - 1.0), 0.0))
+            enter = (-half - root) / square
+            gx, gy = lx + enter * ux, ly + enter * uy
+        else:
+            enter, gx, gy = -FAR, 0.0, 0.0
+            for edge in range(3):
+                ex, ey = EDGE_X[edge], EDGE_Y[edge]
+                into = ex * ux + ey * uy
+                crossing = (EDGE_AT[edge] - ex * lx - ey * ly) / (into if into != 0.0 else 1.0)
+                later = into < 0.0 and crossing > enter
+                enter, gx, gy = (crossing if later else enter), (ex if later else gx), (ey if later else gy)
+        hx, hy = lx + enter * ux, ly + enter * uy
+        scale = 1.0 / (gx * ux + gy * uy)
+        nx, ny = gx * to_x * scale, gy * to_y * scale
+        dr[X, i], dr[Y, i] = nx * cos - ny * sin, nx * sin + ny * cos
+        dr[THETA, i] = ny * width * hx - nx * height * hy
+        dr[WIDTH, i], dr[HEIGHT, i] = nx * hx, ny * hy
+
+
+@inline
 def share_hit(s: float, blur: float) -> float:
     """How much of a ray's footprint hits: 0 at -blur, 1 at blur, smooth in between."""
     if s >= blur:
@@ -230,40 +338,83 @@ def share_hit(s: float, blur: float) -> float:
 
 
 @kernel
-def passing(
-    directions: Any, cos: float, sin: float, x: float, y: float, reach: float, kinds: Any, chosen: Any
+def keep_passing(
+    directions: Any,
+    kinds: Any,
+    z: Any,
+    pose: Any,
+    circle: Any,
+    of_scan: Any,
+    rays: Any,
+    ray_kinds: Any,
+    scan: Any,
+    size: int,
 ) -> int:
-    """Which beams of a scan that say something come within ``reach`` of (x, y), as seen from the laser; their number.
+    """Adds a scan's beams that say something and come near a ``circle`` (x, y, radius) to ``size`` others.
 
-    ``directions`` (N, 2) are in the laser's frame, turned by (cos, sin); indices are left in ``chosen``.
+    ``directions`` (N, 2) are in the laser's frame, ``pose`` (x, y, theta) is the laser's, ``of_scan`` its largest
+    range (m) and its number. ``rays`` (ROWS, room), ``ray_kinds`` and ``scan`` (room,) get what is added; returns how
+    many there are then.
     """
-    ahead, aside = cos * x + sin * y, cos * y - sin * x
-    count = 0
-    for i in range(len(directions)):
-        dx, dy = directions[i, 0], directions[i, 1]
-        if abs(dx * aside - dy * ahead) < reach and dx * ahead + dy * aside > -reach and kinds[i] != SAYS_NOTHING:
-            chosen[count] = i
-            count += 1
-    return count
+    cos, sin = math.cos(pose[2]), math.sin(pose[2])
+    away_x, away_y, reach = circle[0] - pose[0], circle[1] - pose[1], circle[2]
+    for i in range(len(kinds)):
+        dx = cos * directions[i, 0] - sin * directions[i, 1]
+        dy = sin * directions[i, 0] + cos * directions[i, 1]
+        ahead = dx * away_x + dy * away_y
+        if abs(dx * away_y - dy * away_x) < reach and ahead > -reach and kinds[i] != SAYS_NOTHING:
+            rays[ORIGIN_X, size], rays[ORIGIN_Y, size] = pose[0], pose[1]
+            rays[DIRECTION_X, size], rays[DIRECTION_Y, size] = dx, dy
+            rays[RANGE, size], rays[NEAR, size], rays[FARTHEST, size] = z[i], ahead - reach, of_scan[0]
+            ray_kinds[size], scan[size] = kinds[i], of_scan[1]
+            size += 1
+    return size
+
+
+@kernel
+def stop_at(family: int, p: Any, reach: float, beams: Any) -> None:
+    """Cuts the STOP of beams down to where they meet a shape, all of which lies within ``reach`` (m) of its place."""
+    r, s = np.empty(BLOCK), np.empty(BLOCK)
+    size = beams.shape[1]
+    for first in range(0, size, BLOCK):
+        count = min(BLOCK, size - first)
+        passes = False
+        for i in range(first, first + count):
+            away_x, away_y = p[X] - beams[ORIGIN_X, i], p[Y] - beams[ORIGIN_Y, i]
+            passes |= abs(away_x * beams[DIRECTION_Y, i] - away_y * beams[DIRECTION_X, i]) < reach
+        if passes:
+            meet(family, p, beams, first, count, r, s)
+            for i in range(count):
+                if s[i] > 0 and r[i] < beams[STOP, first + i]:
+                    beams[STOP, first + i] = max(r[i], 0.0)
+
+
+@kernel
+def shade(beams: Any, kinds: Any, behind: Any, blocked: Any, sigma: float, table: Any) -> None:
+    """Has beams that something stops before what is ``behind`` (N,) in the map say what they say of that (MISS).
+
+    What is ``blocked`` (N,) in the map before it comes near stops at once.
+    """
+    for i in range(len(kinds)):
+        if beams[STOP, i] < behind[i]:
+            beams[MISS, i] = looked_up(table, kinds[i], (beams[STOP, i] - beams[RANGE, i]) / sigma)
+        if blocked[i]:
+            beams[STOP, i] = 0.0
 
 
 @kernel
 def pass_by(family: int, p: Any, beams: Any, out: Any) -> None:
     """By how much (N,) the lines of beams hit a shape (m), below 0 for a miss; -FAR where it lies behind them."""
-    cos, sin = math.cos(p[THETA]), math.sin(p[THETA])
-    dr, ds = np.zeros(PARAMETERS), np.zeros(PARAMETERS)
-    for i in range(len(beams)):
-        out[i] = told_by(family, p, cos, sin, beams[i], FAR, dr, ds)[1]
+    meet(family, p, beams, 0, len(out), np.empty(len(out)), out)
 
 
 @kernel
 def trace(family: int, p: Any, beams: Any, out: Any) -> None:
     """Distances (N,) of beams to a shape, FAR for a miss; 0 from inside."""
-    cos, sin = math.cos(p[THETA]), math.sin(p[THETA])
-    dr, ds = np.zeros(PARAMETERS), np.zeros(PARAMETERS)
-    for i in range(len(beams)):
-        r, s = told_by(family, p, cos, sin, beams[i], 0.0, dr, ds)
-        out[i] = max(r, 0.0) if s > 0 else FAR
+    s = np.empty(len(out))
+    meet(family, p, beams, 0, len(out), out, s)
+    for i in range(len(out)):
+        out[i] = max(out[i], 0.0) if s[i] > 0 else FAR
 
 
 @kernel
@@ -275,9 +426,9 @@ def margins(family: int, p: Any, covariance: Any, beams: Any, blur: float, out: 
     """
     cos, sin = math.cos(p[THETA]), math.sin(p[THETA])
     dr, ds = np.zeros(PARAMETERS), np.zeros(PARAMETERS)
-    for i in range(len(beams)):
-        r, s = told_by(family, p, cos, sin, beams[i], FAR, dr, ds)
-        if r >= beams[i, STOP] or s == -FAR:
+    for i in range(len(out)):
+        r, s = told_by(family, p, cos, sin, beams, i, FAR, dr, ds)
+        if r >= beams[STOP, i] or s == -FAR:
             out[i] = -FAR
             continue
         variance = 1e-12
@@ -288,25 +439,48 @@ def margins(family: int, p: Any, covariance: Any, beams: Any, blur: float, out: 
         out[i] = clear / math.sqrt(variance)
 
 
+@inline
+def hits_and_edges(beams: Any, first: int, count: int, r: Any, s: Any, blur: float, hits: Any, edges: Any) -> Any:
+    """Which of some beams hit a shape with all of their footprint, and which with a part of it: their numbers.
+
+    ``r`` and ``s`` are as :func:`meet` leaves them. Returns how many hit, how many do in part, and what all others
+    are likely by (nats).
+    """
+    stops, misses = beams[STOP, first : first + count], beams[MISS, first : first + count]
+    hit, edge, missed = 0, 0, 0.0
+    for i in range(count):
+        stopped = r[i] >= stops[i]
+        full, some = s[i] >= blur and s[i] > 0.0 and not stopped, s[i] > -blur and not stopped
+        hits[hit] = i
+        hit += full
+        edges[edge] = i
+        edge += some and not full
+        missed += 0.0 if full or some else misses[i]
+    return hit, edge, missed
+
+
 @kernel
 def costs(family: int, samples: Any, beams: Any, kinds: Any, sigma: float, table: Any, blur: float, out: Any) -> None:
     """The negative log-likelihood of all beams for each of many shapes: ``samples`` (M, 5), ``out`` (M,)."""
-    dr, ds = np.zeros(PARAMETERS), np.zeros(PARAMETERS)
-    for k in range(len(samples)):
-        p = samples[k]
-        cos, sin = math.cos(p[THETA]), math.sin(p[THETA])
-        total = 0.0
-        for i in range(len(beams)):
-            beam = beams[i]
-            r, s = told_by(family, p, cos, sin, beam, blur, dr, ds)
-            miss = beam[MISS]
-            share = share_hit(s, blur) if r < beam[STOP] else 0.0
-            if share <= 0.0:
-                total -= miss
-                continue
-            hit = looked_up(table, kinds[i], (max(r, 0.0) - beam[RANGE]) / sigma)
-            total -= hit if share >= 1.0 else math.log(share * math.exp(hit) + (1.0 - share) * math.exp(miss))
-        out[k] = total
+    r, s = np.empty(BLOCK), np.empty(BLOCK)
+    hits, edges = np.empty(BLOCK + 1, np.int64), np.empty(BLOCK + 1, np.int64)
+    out[:] = 0.0
+    for first in range(0, len(kinds), BLOCK):
+        count = min(BLOCK, len(kinds) - first)
+        for k in range(len(samples)):
+            meet(family, samples[k], beams, first, count, r, s)
+            hit, edge, total = hits_and_edges(beams, first, count, r, s, blur, hits, edges)
+            for n in range(hit):
+                i = hits[n]
+                x = (max(r[i], 0.0) - beams[RANGE, first + i]) / sigma
+                total += looked_up(table, kinds[first + i], x)
+            for n in range(edge):
+                i = edges[n]
+                x = (max(r[i], 0.0) - beams[RANGE, first + i]) / sigma
+                share = share_hit(s[i], blur)
+                hit_chance = math.exp(looked_up(table, kinds[first + i], x))
+                total += math.log(share * hit_chance + (1.0 - share) * math.exp(beams[MISS, first + i]))
+            out[k] -= total
 
 
 @kernel
@@ -315,58 +489,85 @@ def slopes(
     p: Any,
     beams: Any,
     kinds: Any,
-    step: int,
     sigma: float,
     table: Any,
     blur: float,
     gradient: Any,
     information: Any,
 ) -> float:
-    """The negative log-likelihood of every ``step``-th beam, times ``step``; its gradient (5,), information (5, 5).
+    """The negative log-likelihood of all beams; its gradient (5,), information (5, 5).
 
     Information is Gauss and Newton's for rays that hit, and the squared score for what silhouettes say.
     """
-    dr, ds, score = np.zeros(PARAMETERS), np.zeros(PARAMETERS), np.zeros(PARAMETERS)
+    r, s = np.empty(BLOCK), np.empty(BLOCK)
+    hits, edges = np.empty(BLOCK + 1, np.int64), np.empty(BLOCK + 1, np.int64)
+    rays, dr = np.empty((RANGE, BLOCK)), np.empty((PARAMETERS, BLOCK))
+    steep, curve = np.empty(BLOCK), np.empty(BLOCK)
+    moved, slid, score = np.zeros(PARAMETERS), np.zeros(PARAMETERS), np.zeros(PARAMETERS)
     gradient[:] = 0.0
     information[:] = 0.0
     cos, sin = math.cos(p[THETA]), math.sin(p[THETA])
     total = 0.0
-    for i in range(0, len(beams), step):
-        beam = beams[i]
-        r, s = told_by(family, p, cos, sin, beam, blur, dr, ds)
-        miss = beam[MISS]
-        share = share_hit(s, blur) if r < beam[STOP] else 0.0
-        if share <= 0.0:
-            total -= miss
-            continue
-        x = (max(r, 0.0) - beam[RANGE]) / sigma
-        hit = looked_up(table, kinds[i], x)
-        steep = looked_up(table, 3 + kinds[i], x) / sigma
-        responsible, edge = 1.0, 0.0
-        if share < 1.0:
-            hit_chance, miss_chance = math.exp(hit), math.exp(miss)
-            likelihood = share * hit_chance + (1.0 - share) * miss_chance
-            total -= math.log(likelihood)
-            responsible = share * hit_chance / likelihood
-            u = 0.5 * (s / blur + 1.0)
-            edge = (hit_chance - miss_chance) / likelihood * 3.0 * u * (1.0 - u) / blur
-        else:
-            total -= hit
-        curve = steep * steep
-        if kinds[i] == MEASURED:  # -x * (share that is no outlier) is the slope: what is left of it over x
-            curve = -steep / (x * sigma) if abs(x) > 1e-6 else 1.0 / (sigma * sigma)
+    for first in range(0, len(kinds), BLOCK):
+        count = min(BLOCK, len(kinds) - first)
+        meet(family, p, beams, first, count, r, s)
+        hit, edge, missed = hits_and_edges(beams, first, count, r, s, blur, hits, edges)
+        total += missed
+        for n in range(hit):
+            i = first + hits[n]
+            x = (max(r[hits[n]], 0.0) - beams[RANGE, i]) / sigma
+            total += looked_up(table, kinds[i], x)
+            steep[n] = looked_up(table, 3 + kinds[i], x) / sigma
+            curve[n] = curve_of(kinds[i], steep[n], x, sigma)
+            for row in range(RANGE):
+                rays[row, n] = beams[row, i]
+        turn_with(family, p, rays, hit, dr)
         for a in range(PARAMETERS):
-            score[a] = edge * ds[a]
-            gradient[a] -= responsible * steep * dr[a] + score[a]
-        for a in range(PARAMETERS):
+            gradient[a] -= summed(steep, dr[a], dr[a], hit, False)
             for b in range(a + 1):
-                information[a, b] += responsible * curve * dr[a] * dr[b] + score[a] * score[b]
+                information[a, b] += summed(curve, dr[a], dr[b], hit, True)
+        for n in range(edge):
+            i = first + edges[n]
+            at, aside = told_by(family, p, cos, sin, beams, i, blur, moved, slid)
+            x = (max(at, 0.0) - beams[RANGE, i]) / sigma
+            share = share_hit(aside, blur)
+            hit_chance, miss_chance = math.exp(looked_up(table, kinds[i], x)), math.exp(beams[MISS, i])
+            likelihood = share * hit_chance + (1.0 - share) * miss_chance
+            total += math.log(likelihood)
+            responsible = share * hit_chance / likelihood
+            downhill = looked_up(table, 3 + kinds[i], x) / sigma
+            told = responsible * curve_of(kinds[i], downhill, x, sigma)
+            u = 0.5 * (aside / blur + 1.0)
+            slope = (hit_chance - miss_chance) / likelihood * 3.0 * u * (1.0 - u) / blur
+            for a in range(PARAMETERS):
+                score[a] = slope * slid[a]
+                gradient[a] -= responsible * downhill * moved[a] + score[a]
+                for b in range(a + 1):
+                    information[a, b] += told * moved[a] * moved[b] + score[a] * score[b]
     for a in range(PARAMETERS):
-        gradient[a] *= step
-        for b in range(a + 1):
-            information[a, b] *= step
+        for b in range(a):
             information[b, a] = information[a, b]
-    return total * step
+    return -total
+
+
+@inline
+def summed(weight: Any, one: Any, other: Any, count: int, both: bool) -> float:
+    """The sum of ``weight`` times ``one``, and times ``other`` where ``both`` count."""
+    total = 0.0
+    for n in range(count):
+        total += weight[n] * one[n] * (other[n] if both else 1.0)
+    return total
+
+
+@inline
+def curve_of(kind: int, steep: float, x: float, sigma: float) -> float:
+    """How much a ray that hits tells of its distance (1 / m²); ``steep`` is its log-likelihood's slope there.
+
+    Of a range that was measured the slope is -x times the share that is no outlier: what is left of it over x.
+    """
+    if kind != MEASURED:
+        return steep * steep
+    return -steep / (x * sigma) if abs(x) > 1e-6 else 1.0 / (sigma * sigma)
 
 
 @inline
@@ -431,7 +632,6 @@ def descend(
     tie: Any,
     beams: Any,
     kinds: Any,
-    step: int,
     sigma: float,
     table: Any,
     blurs: Any,
@@ -451,7 +651,7 @@ def descend(
     trial = np.zeros(PARAMETERS)
     cost = 0.0
     for blur in blurs:
-        cost = slopes(family, p, beams, kinds, step, sigma, table, blur, gradient, full)
+        cost = slopes(family, p, beams, kinds, sigma, table, blur, gradient, full)
         damping = 1e-2
         for _ in range(iterations):
             project(tie, gradient, full, downhill, information)
@@ -459,7 +659,7 @@ def descend(
                 damping = max(10 * damping, 1e-3)
                 continue
             step_to(p, tie, change, trial)
-            found = slopes(family, trial, beams, kinds, step, sigma, table, blur, other_gradient, other_full)
+            found = slopes(family, trial, beams, kinds, sigma, table, blur, other_gradient, other_full)
             if found < cost:
                 gained = cost - found
                 cost = found
@@ -478,39 +678,61 @@ def descend(
 
 
 @kernel
-def walk(
-    occupied: Any, row: int, col: int, inverse_resolution: float, beams: Any, most: Any, stops: Any, ends: Any
-) -> None:
-    """Where (m) beams end in a map: in the first occupied cell, or (``ends`` False) where they leave it.
-
-    ``occupied`` (rows, cols) begins at cell (row, col) of the plane; ``most`` (N,) are the sensor's largest ranges.
+def clearances(occupied: Any, out: Any) -> None:
+    """How many cells (rows, cols) of a map are from each to the next that is occupied, or beyond the map: steps to any
+    of 8 neighbours, 0 where it is occupied itself, no more than 255.
     """
     rows, cols = occupied.shape
-    for i in range(len(beams)):
-        x, y = beams[i, ORIGIN_X] * inverse_resolution - col, beams[i, ORIGIN_Y] * inverse_resolution - row
-        dx, dy = beams[i, DIRECTION_X], beams[i, DIRECTION_Y]
+    for r in range(rows):
+        for c in range(cols):
+            near = 0
+            if 0 < r and 0 < c < cols - 1:
+                near = min(out[r - 1, c - 1], out[r - 1, c], out[r - 1, c + 1], out[r, c - 1])
+            out[r, c] = 0 if occupied[r, c] else min(near + 1, 255)
+    for r in range(rows - 1, -1, -1):
+        for c in range(cols - 1, -1, -1):
+            near = 0
+            if r < rows - 1 and 0 < c < cols - 1:
+                near = min(out[r + 1, c - 1], out[r + 1, c], out[r + 1, c + 1], out[r, c + 1])
+            out[r, c] = min(out[r, c], near + 1)
+
+
+@kernel
+def walk(clear: Any, row: int, col: int, inverse_resolution: float, beams: Any, most: Any, stops: Any, ends: Any) -> None:
+    """Where (m) beams end in a map: in the first occupied cell, or (``ends`` False) where they leave it.
+
+    ``clear`` (rows, cols), of :func:`clearances`, begins at cell (row, col) of the plane: over what is free several
+    cells are taken at once. ``most`` (N,) are the sensor's largest ranges.
+    """
+    rows, cols = clear.shape
+    for i in range(len(stops)):
+        x, y = beams[ORIGIN_X, i] * inverse_resolution - col, beams[ORIGIN_Y, i] * inverse_resolution - row
+        dx, dy = beams[DIRECTION_X, i], beams[DIRECTION_Y, i]
         far = most[i] * inverse_resolution
         c, r = math.floor(x), math.floor(y)
         step_c, step_r = (1 if dx > 0 else -1), (1 if dy > 0 else -1)
-        per_c = abs(1.0 / dx) if dx != 0.0 else FAR
-        per_r = abs(1.0 / dy) if dy != 0.0 else FAR
-        next_c = ((c + 1 - x) if dx > 0 else (x - c)) * per_c if dx != 0.0 else FAR
-        next_r = ((r + 1 - y) if dy > 0 else (y - r)) * per_r if dy != 0.0 else FAR
+        first_c, first_r = (1 if dx > 0 else 0), (1 if dy > 0 else 0)
+        per_c = 1.0 / dx if dx != 0.0 else FAR
+        per_r = 1.0 / dy if dy != 0.0 else FAR
+        per_cell = min(abs(per_c), abs(per_r))
         at, ends[i] = 0.0, False
         while at < far:
-            leave = min(next_c, next_r)
-            inside = 0 <= c < cols and 0 <= r < rows
-            if inside and occupied[r, c]:
-                at, ends[i] = 0.5 * (at + leave), True
+            next_c = (c + first_c - x) * per_c if dx != 0.0 else FAR
+            next_r = (r + first_r - y) * per_r if dy != 0.0 else FAR
+            if 0 <= c < cols and 0 <= r < rows:
+                free = clear[r, c]
+                if free == 0:
+                    at, ends[i] = 0.5 * (at + min(next_c, next_r)), True
+                    break
+                if free > 2:
+                    at += (free - 1) * per_cell
+                    c, r = math.floor(x + at * dx), math.floor(y + at * dy)
+                    continue
+            elif (c < 0 and dx <= 0) or (c >= cols and dx >= 0) or (r < 0 and dy <= 0) or (r >= rows and dy >= 0):
                 break
-            beyond = (c < 0 and dx <= 0) or (c >= cols and dx >= 0) or (r < 0 and dy <= 0) or (r >= rows and dy >= 0)
-            if beyond:
-                break
-            at = leave
+            at = min(next_c, next_r)
             if next_c <= next_r:
                 c += step_c
-                next_c += per_c
             else:
                 r += step_r
-                next_r += per_r
         stops[i] = min(at, far) / inverse_resolution

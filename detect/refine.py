@@ -27,6 +27,7 @@ from numpy.typing import NDArray
 from detect.beams import (
     Backdrop,
     Beams,
+    Obstacles,
     Sensor,
     backdrop,
     explained,
@@ -244,7 +245,7 @@ def refine(
         return [None] * len(primitives), noise_std
     sensor = Sensor.of(noise_std or min(first_noise(seen), most), span, most=most)
     with ThreadPoolExecutor(threads) as pool:
-        look_behind(seen, cells, CLEARED_FIRST)
+        look_behind(pool, seen, cells, CLEARED_FIRST)
         fit_all(pool, seen, [True] * len(seen), sensor)
         alone = _once(seen, candidates[:preferred], sensor)
         for one in alone:
@@ -255,14 +256,14 @@ def refine(
         sensor = Sensor.of(noise_std or measured_noise(alone, sensor), span, most=most)
         for _ in range(ROUNDS):
             where = [parameters(one.now) for one in alone]
-            changed = look_behind(alone, cells, CLEARED)
+            changed = look_behind(pool, alone, cells, CLEARED)
             fit_all(pool, alone, changed, sensor)
             if all(np.abs(parameters(one.now) - at).max() < SETTLED for one, at in zip(alone, where, strict=True)):
                 break
         sensor = measured(alone, sensor, noise_std)
         fit_all(pool, alone, [sensor.dispersion > CLEARLY] * len(alone), sensor)
-        whole = [backdrop(one.beams, cells.occupied, cells.frame) for one in alone]
-        refined = list(pool.map(lambda one, map_alone: finish(one, map_alone, sensor), alone, whole))
+        whole = Obstacles.of(cells.occupied, cells.frame)
+        refined = list(pool.map(lambda one: finish(one, backdrop(one.beams, whole), sensor), alone))
     made = {id(one): result for one, result in zip(alone, refined, strict=True)}
     return [made.get(id(one)) for one in candidates], sensor.std
 
@@ -283,7 +284,7 @@ def _once(candidates: Sequence[Candidate], preferred: Sequence[Candidate], senso
 def gain_of(candidate: Candidate, among: Sequence[Candidate], sensor: Sensor) -> float:
     """By how much (nats) the rays are likelier with the candidate than with nothing in its place."""
     beams = candidate.seen_before(among, sensor)
-    return float(-beams.rays[:, MISS].sum() - candidate.fits[0].cost)
+    return float(-beams.rays[MISS].sum() - candidate.fits[0].cost)
 
 
 def finish(candidate: Candidate, map_alone: Backdrop, sensor: Sensor) -> Refined | None:
@@ -293,7 +294,7 @@ def finish(candidate: Candidate, map_alone: Backdrop, sensor: Sensor) -> Refined
     told = weighed(candidate.fits, beams, sensor)
     if told is None or not candidate.may_be(told.primitive):
         return None
-    gain = float(-beams.rays[:, MISS].sum() - told.cost)
+    gain = float(-beams.rays[MISS].sum() - told.cost)
     misfit, rays, seen = _held_against_map(told.primitive, beams, map_alone, sensor)
     chances = candidate.known.chances if candidate.known is not None else None
     return Refined(told.primitive, told.std, told.covariance, chances or told.chances, gain, misfit, rays, seen)
@@ -306,12 +307,12 @@ def _held_against_map(
     in what share of the directions around it they meet it.
     """
     distance = distance_to(primitive, beams)
-    meets = distance < beams.rays[:, STOP]
+    meets = distance < beams.rays[STOP]
     if not meets.any():
         return 0.0, 0, 0.0
     met = beams.of(meets)
     own = np.log(explained(met, distance[meets], np.ones(len(met), np.bool_), 0.0, sensor))
     free = np.log(explained(met, map_alone.stops[meets], map_alone.ends[meets], map_alone.spread, sensor))
-    points = met.rays[:, :2] + distance[meets, None] * met.rays[:, 2:4] - (primitive.x, primitive.y)
-    sectors = np.floor(np.arctan2(points[:, 1], points[:, 0]) / (2 * math.pi) * SECTORS).astype(int) % SECTORS
+    x, y = met.rays[:2] + distance[meets] * met.rays[2:4] - [[primitive.x], [primitive.y]]
+    sectors = np.floor(np.arctan2(y, x) / (2 * math.pi) * SECTORS).astype(int) % SECTORS
     return float((free - own).mean()), len(met), len(np.unique(sectors)) / SECTORS

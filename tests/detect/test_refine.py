@@ -10,7 +10,7 @@ import pytest
 from hypothesis import assume, given
 from hypothesis import strategies as st
 
-from detect.beams import MOST, Gatherer, Sensor, backdrop, before, gather, map_says, parameters
+from detect.beams import MOST, Gatherer, Obstacles, Sensor, backdrop, before, gather, map_says, parameters
 from detect.cells import MapCells, OneSided, is_within
 from detect.detector import Detection, Detections, Rejection
 from detect.evidence import exact_costs
@@ -269,7 +269,7 @@ def test_behind_a_primitive_stands_what_the_map_and_the_others_say() -> None:
     cells = MapCells.of(mapped(taken))
     sensor = Sensor.of(0.01, span)
     occupied = cells.without(world.primitives, 0.02)
-    behind = backdrop(around, occupied, cells.frame)
+    behind = backdrop(around, Obstacles.of(occupied, cells.frame))
     beams = before(around, behind, map_says(around, behind, sensor), [world.primitives[1]], sensor)
     exact = world.cast((0.0, 0.0), np.array([[1.0, 0.0]]))
     assert len(beams) and np.isfinite(beams.rays).all() and exact[0] > 0
