@@ -18,7 +18,10 @@ COARSE_RAYS, SEARCH_RAYS = 800, 1600
 
 COARSE_BLURS = (0.03, 0.012)
 FINE_BLURS = (0.008, 0.001)
-"""Fits go from one blur (m, half a footprint) to the next; the last is no smaller than the sensor's own."""
+LAST_BLURS = (0.012, 0.004, 0.001, 0.0003)
+"""Fits go from one blur (m, half a footprint) to the next, none smaller than the sensor's own: from starts, from the
+best of these, and from fits that were made before. The last is as narrow as silhouettes are known.
+"""
 
 COARSE_STEPS, FINE_STEPS = 8, 10
 TOLERANCE, ROUGH = 0.1, 0.5
@@ -131,7 +134,7 @@ def search(now: Primitive, beams: Beams, sensor: Sensor) -> list[Fit]:
     hopeful = {kind for kind, ways in ranked.items() if ways[0][0] < limit}
     hopeful |= {simple for kind, simple in SIMPLER.items() if kind in hopeful}
     some = Share.of(beams, SEARCH_RAYS)
-    return [_fine(kind, _best_ways(ranked[kind]), some, sensor) for kind in Kind if kind in hopeful]
+    return [_fine(kind, _best_ways(ranked[kind]), some, sensor, FINE_BLURS) for kind in Kind if kind in hopeful]
 
 
 def _best_ways(ranked: Sequence[tuple[float, FloatArray]]) -> list[FloatArray]:
@@ -153,15 +156,15 @@ def _ranked(kind: Kind, ways: Sequence[FloatArray], beams: Beams, sensor: Sensor
 
 def again(fits: Sequence[Fit], beams: Beams, sensor: Sensor) -> list[Fit]:
     """Kinds fitted again, from where they are."""
-    return [_fine(fit.kind, [fit.p], Share(beams), sensor) for fit in fits]
+    return [_fine(fit.kind, [fit.p], Share(beams), sensor, LAST_BLURS) for fit in fits]
 
 
-def _fine(kind: Kind, ways: Sequence[FloatArray], share: Share, sensor: Sensor) -> Fit:
+def _fine(kind: Kind, ways: Sequence[FloatArray], share: Share, sensor: Sensor, blurs: Sequence[float]) -> Fit:
     """The best fit from some ``ways``; a triangle's also with the other two corners as its apex."""
-    best = min((_fit(kind, p, share, sensor, FINE_BLURS, FINE_STEPS) for p in ways), key=lambda fit: fit.cost)
+    best = min((_fit(kind, p, share, sensor, blurs, FINE_STEPS) for p in ways), key=lambda fit: fit.cost)
     if kind is not Kind.TRIANGLE:
         return best
-    others = [_fit(kind, p, share, sensor, FINE_BLURS, FINE_STEPS) for p in other_apexes(best.p)]
+    others = [_fit(kind, p, share, sensor, blurs, FINE_STEPS) for p in other_apexes(best.p)]
     return min([best, *others], key=lambda fit: fit.cost)
 
 

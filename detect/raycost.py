@@ -698,7 +698,9 @@ def clearances(occupied: Any, out: Any) -> None:
 
 
 @kernel
-def walk(clear: Any, row: int, col: int, inverse_resolution: float, beams: Any, most: Any, stops: Any, ends: Any) -> None:
+def walk(
+    clear: Any, row: int, col: int, inverse_resolution: float, beams: Any, most: Any, stops: Any, ends: Any
+) -> None:
     """Where (m) beams end in a map: in the first occupied cell, or (``ends`` False) where they leave it.
 
     ``clear`` (rows, cols), of :func:`clearances`, begins at cell (row, col) of the plane: over what is free several
