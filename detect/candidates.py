@@ -95,12 +95,13 @@ def fit_all(pool: Executor, candidates: Sequence[Candidate], anew: Sequence[bool
 def _fit_one(candidate: Candidate, beams: Beams, sensor: Sensor, anew: bool) -> None:
     """Leaves a candidate's kinds, likeliest first, as far as a Gaussian tells their evidence."""
     before = candidate.fitted_to
-    if candidate.known is not None:
-        fits = again([candidate.known_fit], beams, sensor)
-    elif anew or before is None:
-        fits = search(candidate.now, beams, sensor)
-    elif _much_alike(before[0], sensor) and before[1].much_alike(beams):
+    searched = candidate.known is None and (anew or before is None)
+    if before is not None and not searched and _much_alike(before[0], sensor) and before[1].much_alike(beams):
         return
+    if searched:
+        fits = search(candidate.now, beams, sensor)
+    elif candidate.known is not None:
+        fits = again([candidate.known_fit], beams, sensor)
     else:
         fits = again(candidate.fits, beams, sensor)
     possible = [fit for fit in fits if candidate.may_be(primitive_of(fit.kind, fit.p))]

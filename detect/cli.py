@@ -66,6 +66,7 @@ class YoloPresetName(StrEnum):
     PRIM = "prim"
     PAPER = "paper"
     DRAWINGS = "drawings"
+    MORE = "more"
 
 
 def _show_version(wanted: bool) -> None:
@@ -196,7 +197,7 @@ def yolo(
     output: Annotated[Path, typer.Argument(metavar="FOLDER", help="Where ultralytics leaves its run.")],
     mapper: Annotated[ImagesName, typer.Option(help="Whose maps to learn from.")] = ImagesName.FORWARD,
     preset: Annotated[
-        YoloPresetName, typer.Option(help="Ours, the paper's settings, or one for drawings.")
+        YoloPresetName, typer.Option(help="Ours, the paper's settings, one for drawings, or more of ours.")
     ] = YoloPresetName.PRIM,
     epochs: Annotated[
         int | None, typer.Option(metavar="N", help="Passes over the set. [default: the preset's]")

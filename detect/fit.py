@@ -23,6 +23,9 @@ LAST_BLURS = (0.012, 0.004, 0.001, 0.0003)
 best of these, and from fits that were made before. The last is as narrow as silhouettes are known.
 """
 
+KNOWN_TO = 0.001
+"""What silhouettes tell is asked with this blur (m): it is a sum of jumps, which narrower ones would take for all."""
+
 COARSE_STEPS, FINE_STEPS = 8, 10
 TOLERANCE, ROUGH = 0.1, 0.5
 """A fit ends where a step gains less than this (nats); one that only tells what to go on with, than the latter."""
@@ -206,6 +209,7 @@ def _fit(
         np.maximum(blurs, sensor.footprint),
         steps,
         tolerance / share.each,
+        max(KNOWN_TO, sensor.footprint),
         information,
     )
     return Fit(kind, found, share.each * cost, share.each * information)

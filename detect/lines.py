@@ -50,9 +50,9 @@ def _most_on_a_line(points: FloatArray, resolution: float, rng: np.random.Genera
 
 @kernel
 def best_pair(points: Any, pairs: Any, resolution: float) -> int:
-    """Which pair (T, 2) of points (2, N) has the line with most within a cell; pairs less than 8 cells apart have none.
+    """Which pair (T, 2) of points (2, N) has the line with most within a cell: the first where there are several.
 
-    The first where there are several.
+    Pairs less than 8 cells apart have no line.
     """
     best, most = 0, 0
     for k in range(len(pairs)):

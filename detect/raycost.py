@@ -22,10 +22,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mapping.rays import compiled, inline
+from mapping.rays import compiled
 
-kernel = compiled(inline="never", fastmath={"arcp", "contract", "reassoc", "nsz"})
+FAST = {"arcp", "contract", "reassoc", "nsz"}
 """Divisions by what stays the same may become products; infinities and NaN keep their meaning."""
+
+kernel = compiled(inline="never", fastmath=FAST)
+part = compiled(cache=False, forceinline=True, fastmath=FAST)
+"""What kernels are made of."""
 
 BOX, DISC, TRIANGLE = 0, 1, 2
 """Unit shapes: [-1/2, 1/2]², radius 1, and corners (-1/2, -1/3), (1/2, -1/3), (0, 2/3)."""
@@ -52,6 +56,9 @@ TABLE_SPACING = 64
 
 SMALLEST, LARGEST = 0.02, 1.2
 """Width and height (m; of a disc the semi-axes) stay between these while a fit descends."""
+
+HOPEFUL, HOPELESS = 1e-2, 1e4
+"""A descent's damping begins with the one, and ends it beyond the other."""
 
 EDGE_X = (0.0, 2.0 / math.sqrt(5.0), -2.0 / math.sqrt(5.0))
 EDGE_Y = (-1.0, 1.0 / math.sqrt(5.0), 1.0 / math.sqrt(5.0))
@@ -89,7 +96,7 @@ def tables(outlier: float) -> NDArray[np.float64]:
     return np.stack([np.log(measured), np.log(near), np.log(far), *slopes])
 
 
-@inline
+@part
 def looked_up(table: Any, row: int, x: float) -> float:
     """A row of the table at x, linear between its entries."""
     place = (min(max(x, -TABLE_REACH), TABLE_REACH) + TABLE_REACH) * TABLE_SPACING
@@ -98,7 +105,7 @@ def looked_up(table: Any, row: int, x: float) -> float:
     return low + (place - entry) * (float(table[row, entry + 1]) - low)
 
 
-@inline
+@part
 def entry(family: int, lx: float, ly: float, ux: float, uy: float) -> tuple[float, float, float]:
     """Where the line l + t u enters a unit shape: t (below 0 from inside), and the outward normal there.
 
@@ -144,7 +151,7 @@ def entry(family: int, lx: float, ly: float, ux: float, uy: float) -> tuple[floa
     return t, nx, ny
 
 
-@inline
+@part
 def extreme(family: int, mx: float, my: float) -> tuple[float, float]:
     """The point of a unit shape that lies farthest along (mx, my)."""
     if family == DISC:
@@ -158,7 +165,7 @@ def extreme(family: int, mx: float, my: float) -> tuple[float, float]:
     return (0.5 if mx >= 0 else -0.5), -1.0 / 3.0
 
 
-@inline
+@part
 def slide(sign: float, ax: float, ay: float, bx: float, by: float, width: float, height: float, dr: Any) -> None:
     """How the distance to an ellipse's silhouette changes with its angle and axes: its point slides on the outline.
 
@@ -172,7 +179,7 @@ def slide(sign: float, ax: float, ay: float, bx: float, by: float, width: float,
     dr[HEIGHT] = sign * (2 * height * ay * by / reach - along * height * ay * ay / reach**3)
 
 
-@inline
+@part
 def told_by(
     family: int, p: Any, cos: float, sin: float, beams: Any, i: int, blur: float, dr: Any, ds: Any
 ) -> tuple[float, float]:
@@ -225,7 +232,7 @@ def told_by(
     return t, s
 
 
-@inline
+@part
 def meet(family: int, p: Any, beams: Any, first: int, count: int, r: Any, s: Any) -> None:
     """As :func:`told_by` of ``count`` rays from the ``first`` on, without derivatives: several rays at once.
 
@@ -283,7 +290,7 @@ def meet(family: int, p: Any, beams: Any, first: int, count: int, r: Any, s: Any
         s[i] = -FAR if hits and leave < 0.0 else beside
 
 
-@inline
+@part
 def turn_with(family: int, p: Any, rays: Any, count: int, dr: Any) -> None:
     """The derivatives ``dr`` (5, count) by p of the distances to a shape that all ``rays`` (4, count) hit.
 
@@ -326,7 +333,7 @@ def turn_with(family: int, p: Any, rays: Any, count: int, dr: Any) -> None:
         dr[WIDTH, i], dr[HEIGHT, i] = nx * hx, ny * hy
 
 
-@inline
+@part
 def share_hit(s: float, blur: float) -> float:
     """How much of a ray's footprint hits: 0 at -blur, 1 at blur, smooth in between."""
     if s >= blur:
@@ -439,7 +446,7 @@ def margins(family: int, p: Any, covariance: Any, beams: Any, blur: float, out: 
         out[i] = clear / math.sqrt(variance)
 
 
-@inline
+@part
 def hits_and_edges(beams: Any, first: int, count: int, r: Any, s: Any, blur: float, hits: Any, edges: Any) -> Any:
     """Which of some beams hit a shape with all of their footprint, and which with a part of it: their numbers.
 
@@ -550,7 +557,7 @@ def slopes(
     return -total
 
 
-@inline
+@part
 def summed(weight: Any, one: Any, other: Any, count: int, both: bool) -> float:
     """The sum of ``weight`` times ``one``, and times ``other`` where ``both`` count."""
     total = 0.0
@@ -559,7 +566,7 @@ def summed(weight: Any, one: Any, other: Any, count: int, both: bool) -> float:
     return total
 
 
-@inline
+@part
 def curve_of(kind: int, steep: float, x: float, sigma: float) -> float:
     """How much a ray that hits tells of its distance (1 / m²); ``steep`` is its log-likelihood's slope there.
 
@@ -570,7 +577,7 @@ def curve_of(kind: int, steep: float, x: float, sigma: float) -> float:
     return -steep / (x * sigma) if abs(x) > 1e-6 else 1.0 / (sigma * sigma)
 
 
-@inline
+@part
 def solve(matrix: Any, vector: Any, damping: float, out: Any, lower: Any, size: int) -> bool:
     """Solves (matrix + damping diag(matrix)) out = vector by Cholesky's factors; False where there are none."""
     for a in range(size):
@@ -599,7 +606,7 @@ def solve(matrix: Any, vector: Any, damping: float, out: Any, lower: Any, size: 
     return True
 
 
-@inline
+@part
 def project(tie: Any, gradient: Any, full: Any, downhill: Any, information: Any) -> None:
     """A kind's own downhill direction (K,) and information (K, K), of those of the five parameters."""
     size = tie.shape[1]
@@ -614,7 +621,7 @@ def project(tie: Any, gradient: Any, full: Any, downhill: Any, information: Any)
                     information[k, m] += tie[a, k] * full[a, b] * tie[b, m]
 
 
-@inline
+@part
 def step_to(p: Any, tie: Any, change: Any, trial: Any) -> None:
     """Where a change (K,) of a kind's own parameters leads; a size is no more than halved or doubled."""
     for a in range(PARAMETERS):
@@ -637,28 +644,24 @@ def descend(
     blurs: Any,
     iterations: int,
     tolerance: float,
+    known_to: float,
     information: Any,
 ) -> float:
     """Moves p (5,) downhill by Levenberg and Marquardt's steps, with one blur after the other.
 
-    ``tie`` (5, K) maps a kind's own parameters to the five. Returns the cost at the last blur, and leaves there the
-    ``information`` (K, K) on a kind's own parameters.
+    ``tie`` (5, K) maps a kind's own parameters to the five. Returns the cost at the last blur, and leaves the
+    ``information`` (K, K) on a kind's own parameters, with a blur of ``known_to`` (m) where the last is narrower.
     """
     size = tie.shape[1]
     gradient, full = np.zeros(PARAMETERS), np.zeros((PARAMETERS, PARAMETERS))
     other_gradient, other_full = np.zeros(PARAMETERS), np.zeros((PARAMETERS, PARAMETERS))
     downhill, change, lower = np.zeros(size), np.zeros(size), np.zeros((size, size))
     trial = np.zeros(PARAMETERS)
-    cost = 0.0
+    cost = math.inf
     for blur in blurs:
-        cost = slopes(family, p, beams, kinds, sigma, table, blur, gradient, full)
-        damping = 1e-2
-        for _ in range(iterations):
-            project(tie, gradient, full, downhill, information)
-            if not solve(information, downhill, damping, change, lower, size):
-                damping = max(10 * damping, 1e-3)
-                continue
-            step_to(p, tie, change, trial)
+        cost, damping = math.inf, HOPEFUL
+        trial[:] = p
+        for count in range(iterations + 1):
             found = slopes(family, trial, beams, kinds, sigma, table, blur, other_gradient, other_full)
             if found < cost:
                 gained = cost - found
@@ -666,27 +669,34 @@ def descend(
                 p[:] = trial
                 gradient[:] = other_gradient
                 full[:] = other_full
-                damping = max(0.2 * damping, 1e-6)
+                damping = max(0.2 * damping, 1e-6) if count else damping
                 if gained < tolerance:
                     break
             else:
                 damping *= 8
-                if damping > 1e4:
-                    break
+            project(tie, gradient, full, downhill, information)
+            while damping < HOPELESS and not solve(information, downhill, damping, change, lower, size):
+                damping = max(10 * damping, 1e-3)
+            if damping > HOPELESS:
+                break
+            step_to(p, tie, change, trial)
+    if blurs[-1] < known_to:
+        slopes(family, p, beams, kinds, sigma, table, known_to, gradient, full)
     project(tie, gradient, full, downhill, information)
     return cost
 
 
 @kernel
 def clearances(occupied: Any, out: Any) -> None:
-    """How many cells (rows, cols) of a map are from each to the next that is occupied, or beyond the map: steps to any
-    of 8 neighbours, 0 where it is occupied itself, no more than 255.
+    """How many steps (to any of 8 neighbours) it is from each cell of a map to one that is occupied, or beyond it.
+
+    0 where it is occupied itself, no more than 255.
     """
     rows, cols = occupied.shape
     for r in range(rows):
         for c in range(cols):
             near = 0
-            if 0 < r and 0 < c < cols - 1:
+            if r > 0 and 0 < c < cols - 1:
                 near = min(out[r - 1, c - 1], out[r - 1, c], out[r - 1, c + 1], out[r, c - 1])
             out[r, c] = 0 if occupied[r, c] else min(near + 1, 255)
     for r in range(rows - 1, -1, -1):

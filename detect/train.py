@@ -251,12 +251,13 @@ class YoloOptions:
 
 YOLO_PRESETS = {
     "prim": YoloOptions(),
+    "more": YoloOptions(epochs=16, learning_rate=0.001),
     "transfer": YoloOptions(epochs=8, learning_rate=0.001),
     "paper": YoloOptions(epochs=32, image_size=224, optimizer="SGD", learning_rate=0.01, turn=False),
     "drawings": YoloOptions(epochs=3, mosaic=False, turn=False),
 }
-"""Ours, from drawings and from another mapper's network; the paper's (IV-B: 32 epochs, batch 32, SGD, learning rate
-0.01); and one for detect.drawings, which vary by themselves."""
+"""Ours, from drawings, on from there with more sessions, and from another mapper's network; the paper's (IV-B: 32
+epochs, batch 32, SGD, learning rate 0.01); and one for detect.drawings, which vary by themselves."""
 
 
 def train_yolo(data: Path, mapper: str, output: Path, options: YoloOptions) -> Path:

@@ -26,6 +26,9 @@ if TYPE_CHECKING:
 SCANS_ON_THE_WAY = 60
 """A look on the way is refined by so many of the scans to twice as many, evenly spread."""
 
+ASKED_AGAIN = 4
+"""On the way, what was sure of its kind is asked for it again when there are so many times as many scans."""
+
 PROPOSED_FROM = 40
 """On the way, what the networks missed is looked for when there are so many scans."""
 
@@ -132,14 +135,14 @@ class Lookout:
         """Detections fitted to the rays of all ``scans``, or of those so far; and the noise (m) of these rays.
 
         On the way some of the scans do, and what was sure of its kind at the last look is asked for it again only
-        when there are twice as many scans as when it was asked last.
+        when there are ASKED_AGAIN times as many scans as when it was asked last.
         """
         from detect.refine import refine_detections  # when it is needed: a replay without it starts faster
 
         if scans is not None:
             refined, noise_std = refine_detections(detections, scans, grid, self._noise_std, cores())
             return self._in_unsure_frame(refined), noise_std
-        anew = self._count >= 2 * self._searched_at
+        anew = self._count >= ASKED_AGAIN * self._searched_at
         if anew:
             self._searched_at = self._count
         before = None if anew else self._before
