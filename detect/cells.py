@@ -6,12 +6,14 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from detect.lines import Line, find_lines
 from mapping.grid import GridFrame, OccupancyGrid
+from mapping.rays import kernel
 from prim.metrics import BoolGrid, dilate
 from prim.raycast import FloatArray
 from prim.shapes import Kind, Primitive
@@ -135,16 +137,42 @@ def _cells_around(frame: GridFrame, primitive: Primitive, reach: float) -> tuple
 
 def _connected(occupied: BoolGrid, frame: GridFrame) -> tuple[NDArray[np.int32], BoolGrid]:
     """Occupied cells numbered by what hangs together, and which of them hang together over more than LARGE."""
-    from scipy import ndimage  # when it is needed: a replay without refinement starts faster
+    labels, large = np.zeros(occupied.shape, np.int32), np.zeros_like(occupied)
+    number_connected(occupied, LARGE / frame.resolution, labels, large)
+    return labels, large
 
-    labels, _ = ndimage.label(occupied, np.ones((3, 3)))
-    cells = LARGE / frame.resolution
-    large = [
-        number
-        for number, (rows, cols) in enumerate(ndimage.find_objects(labels), start=1)
-        if max(rows.stop - rows.start, cols.stop - cols.start) > cells
-    ]
-    return labels, np.isin(labels, large)
+
+@kernel
+def number_connected(occupied: Any, most: float, labels: Any, large: Any) -> None:
+    """Numbers occupied cells (rows, cols) by what hangs together, through any of 8 neighbours, from 1 on: ``labels``.
+
+    ``large`` are those of what reaches over more than ``most`` cells along an axis.
+    """
+    rows, cols = occupied.shape
+    stack = np.empty((occupied.sum(), 2), np.int64)
+    number = 0
+    for row in range(rows):
+        for col in range(cols):
+            if not occupied[row, col] or labels[row, col]:
+                continue
+            number += 1
+            labels[row, col] = number
+            stack[0] = row, col
+            done, found = 0, 1
+            bottom, left, right = row, col, col
+            while done < found:
+                r, c = stack[done]
+                done += 1
+                bottom, left, right = max(bottom, r), min(left, c), max(right, c)
+                for near_r in range(max(r - 1, 0), min(r + 2, rows)):
+                    for near_c in range(max(c - 1, 0), min(c + 2, cols)):
+                        if occupied[near_r, near_c] and not labels[near_r, near_c]:
+                            labels[near_r, near_c] = number
+                            stack[found] = near_r, near_c
+                            found += 1
+            if max(bottom - row, right - left) + 1 > most:
+                for cell in range(found):
+                    large[stack[cell, 0], stack[cell, 1]] = True
 
 
 def _along_lines(grid: OccupancyGrid) -> tuple[BoolGrid, list[OneSided]]:

@@ -204,7 +204,7 @@ def exact_costs(kind: Kind, shapes: FloatArray, beams: Beams, sensor: Sensor) ->
     right = np.asarray(((shapes[:, 3:] > 1e-3) & (shapes[:, 3:] < longest(kind))).all(axis=1))
     safe = np.where(right[:, None], shapes, shapes[np.argmax(right)])
     costs(
-        FAMILY[kind],
+        np.full(len(shapes), FAMILY[kind]),
         np.ascontiguousarray(safe),
         beams.rays,
         beams.kinds,

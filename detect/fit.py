@@ -16,19 +16,27 @@ from prim.shapes import SIZE_KEYS, Kind, Primitive
 COARSE_RAYS, SEARCH_RAYS = 800, 1600
 """To about so many rays starts are fitted, and what comes of the best of them."""
 
-COARSE_BLURS = (0.03, 0.012)
-FINE_BLURS = (0.008, 0.001)
-LAST_BLURS = (0.012, 0.004, 0.001, 0.0003)
-"""Fits go from one blur (m, half a footprint) to the next, none smaller than the sensor's own: from starts, from the
-best of these, and from fits that were made before. The last is as narrow as silhouettes are known.
-"""
-
 KNOWN_TO = 0.001
 """What silhouettes tell is asked with this blur (m): it is a sum of jumps, which narrower ones would take for all."""
 
-COARSE_STEPS, FINE_STEPS = 8, 10
-TOLERANCE, ROUGH = 0.1, 0.5
-"""A fit ends where a step gains less than this (nats); one that only tells what to go on with, than the latter."""
+
+@dataclass(frozen=True)
+class Descent:
+    """How a fit descends: from one blur (m, half a footprint) to the next, none smaller than the sensor's own, with
+    no more than so many ``steps`` at each, ending where a step gains less than the ``tolerance`` (nats).
+    """
+
+    blurs: tuple[float, ...]
+    steps: int
+    tolerance: float
+
+
+COARSE = Descent((0.03, 0.012), 8, 0.5)
+FINE = Descent((0.008, 0.001), 10, 0.1)
+LAST = Descent((0.012, 0.004, 0.001, 0.0003), 10, 0.1)
+"""From starts, to tell what to go on with; from the best of these; and from fits that were made before: as narrow as
+silhouettes are known.
+"""
 
 HOPELESS, HOPELESS_WAY = 60.0, 20.0
 """A kind whose coarse fit is this much (nats) less likely than the best one's is not fitted to all rays, nor is
@@ -53,6 +61,10 @@ class Fit:
     p: FloatArray
     cost: float
     information: FloatArray
+
+
+Way = tuple[Kind, FloatArray]
+"""A kind, and the five parameters that a fit of it begins with."""
 
 
 @dataclass(frozen=True)
@@ -129,46 +141,49 @@ def search(now: Primitive, beams: Beams, sensor: Sensor) -> list[Fit]:
     Starts are fitted to some of the rays, and held against all of them, beside what it was taken for ``now``; from
     the best of each kind the fit goes on with more rays.
     """
-    few = Share.of(beams, COARSE_RAYS)
-    tried = {kind: [_coarse(kind, p, few, sensor).p for p in starts(now, kind)] for kind in Kind}
-    tried[now.kind].append(parameters(now))
-    ranked = {kind: _ranked(kind, ways, beams, sensor) for kind, ways in tried.items()}
-    limit = min(ways[0][0] for ways in ranked.values()) + HOPELESS
-    hopeful = {kind for kind, ways in ranked.items() if ways[0][0] < limit}
+    ways = [(kind, p) for kind in Kind for p in starts(now, kind)]
+    coarse = _fit_each(ways, Share.of(beams, COARSE_RAYS), sensor, COARSE)
+    ranked = _ranked([*((fit.kind, fit.p) for fit in coarse), (now.kind, parameters(now))], beams, sensor)
+    best: dict[Kind, float] = {}
+    for cost, (kind, _) in ranked:
+        best.setdefault(kind, cost)
+    hopeful = {kind for kind, cost in best.items() if cost < min(best.values()) + HOPELESS}
     hopeful |= {simple for kind, simple in SIMPLER.items() if kind in hopeful}
-    some = Share.of(beams, SEARCH_RAYS)
-    return [_fine(kind, _best_ways(ranked[kind]), some, sensor, FINE_BLURS) for kind in Kind if kind in hopeful]
+    chosen: list[Way] = []
+    for kind in Kind:
+        own = [way for cost, way in ranked if way[0] is kind and cost < best[kind] + HOPELESS_WAY]
+        chosen += own[:WAYS] if kind in hopeful else []
+    return _finely(chosen, Share.of(beams, SEARCH_RAYS), sensor, FINE)
 
 
-def _best_ways(ranked: Sequence[tuple[float, FloatArray]]) -> list[FloatArray]:
-    """Those of a kind's coarse fits that are gone on with."""
-    return [p for cost, p in ranked if cost < ranked[0][0] + HOPELESS_WAY][:WAYS]
-
-
-def _coarse(kind: Kind, p: FloatArray, share: Share, sensor: Sensor) -> Fit:
-    """A fit that only tells what to go on with."""
-    return _fit(kind, p, share, sensor, COARSE_BLURS, COARSE_STEPS, ROUGH)
-
-
-def _ranked(kind: Kind, ways: Sequence[FloatArray], beams: Beams, sensor: Sensor) -> list[tuple[float, FloatArray]]:
-    """Parameters of a kind with their costs (nats) over all beams, somewhat blurred, best first."""
+def _ranked(ways: Sequence[Way], beams: Beams, sensor: Sensor) -> list[tuple[float, Way]]:
+    """Ways with their costs (nats) over all beams, somewhat blurred, best first."""
     out = np.empty(len(ways))
-    costs(FAMILY[kind], np.stack(ways), beams.rays, beams.kinds, sensor.std, sensor.table, FINE_BLURS[0], out)
+    families = np.array([FAMILY[kind] for kind, _ in ways])
+    shapes = np.stack([p for _, p in ways])
+    costs(families, shapes, beams.rays, beams.kinds, sensor.std, sensor.table, FINE.blurs[0], out)
     return sorted(zip(out.tolist(), ways, strict=True), key=lambda one: one[0])
 
 
 def again(fits: Sequence[Fit], beams: Beams, sensor: Sensor) -> list[Fit]:
     """Kinds fitted again, from where they are."""
-    return [_fine(fit.kind, [fit.p], Share(beams), sensor, LAST_BLURS) for fit in fits]
+    return _finely([(fit.kind, fit.p) for fit in fits], Share(beams), sensor, LAST)
 
 
-def _fine(kind: Kind, ways: Sequence[FloatArray], share: Share, sensor: Sensor, blurs: Sequence[float]) -> Fit:
-    """The best fit from some ``ways``; a triangle's also with the other two corners as its apex."""
-    best = min((_fit(kind, p, share, sensor, blurs, FINE_STEPS) for p in ways), key=lambda fit: fit.cost)
-    if kind is not Kind.TRIANGLE:
-        return best
-    others = [_fit(kind, p, share, sensor, blurs, FINE_STEPS) for p in other_apexes(best.p)]
-    return min([best, *others], key=lambda fit: fit.cost)
+def _finely(ways: Sequence[Way], share: Share, sensor: Sensor, how: Descent) -> list[Fit]:
+    """The best fit of each kind from some ways to it; a triangle's also with the other two corners as its apex."""
+    best: dict[Kind, Fit] = {}
+
+    def keep(fits: Sequence[Fit]) -> None:
+        for fit in fits:
+            if fit.kind not in best or fit.cost < best[fit.kind].cost:
+                best[fit.kind] = fit
+
+    keep(_fit_each(ways, share, sensor, how))
+    if Kind.TRIANGLE in best:
+        others = [(Kind.TRIANGLE, p) for p in other_apexes(best[Kind.TRIANGLE].p)]
+        keep(_fit_each(others, share, sensor, how))
+    return list(best.values())
 
 
 def other_apexes(p: FloatArray) -> list[FloatArray]:
@@ -186,33 +201,37 @@ def other_apexes(p: FloatArray) -> list[FloatArray]:
     return [np.array([x, y, theta + way, leg, tall]) for way in (turn, -turn)]
 
 
-def _fit(
-    kind: Kind,
-    p: FloatArray,
-    share: Share,
-    sensor: Sensor,
-    blurs: Sequence[float],
-    steps: int,
-    tolerance: float = TOLERANCE,
-) -> Fit:
-    """The nearest best fit of a kind to some of the beams; its cost and information as all would make them."""
-    tie = TIES[kind]
-    found, information = p.copy(), np.zeros((tie.shape[1], tie.shape[1]))
-    cost = descend(
-        FAMILY[kind],
+def _fit_each(ways: Sequence[Way], share: Share, sensor: Sensor, how: Descent) -> list[Fit]:
+    """The nearest best fit from each way to some of the beams; cost and information are what all would make them."""
+    if not ways:
+        return []
+    ties = np.zeros((len(ways), PARAMETERS, PARAMETERS))
+    sizes = np.array([TIES[kind].shape[1] for kind, _ in ways])
+    for tie, size, (kind, _) in zip(ties, sizes.tolist(), ways, strict=True):
+        tie[:, :size] = TIES[kind]
+    found, cost = np.stack([p for _, p in ways]), np.empty(len(ways))
+    information = np.zeros_like(ties)
+    descend(
+        np.array([FAMILY[kind] for kind, _ in ways]),
         found,
-        tie,
+        ties,
+        sizes,
         share.beams.rays,
         share.beams.kinds,
         sensor.std,
         sensor.table,
-        np.maximum(blurs, sensor.footprint),
-        steps,
-        tolerance / share.each,
+        np.maximum(how.blurs, sensor.footprint),
+        how.steps,
+        how.tolerance / share.each,
         max(KNOWN_TO, sensor.footprint),
+        cost,
         information,
     )
-    return Fit(kind, found, share.each * cost, share.each * information)
+    cost, information = share.each * cost, share.each * information
+    return [
+        Fit(kind, p, float(nats), known[:size, :size])
+        for (kind, _), p, nats, known, size in zip(ways, found, cost, information, sizes.tolist(), strict=True)
+    ]
 
 
 def primitive_of(kind: Kind, p: FloatArray) -> Primitive:

@@ -34,8 +34,8 @@ MOST_PROPOSALS = 24
 """No more than so many are proposed, those of the most cells: a map that is full of specks says nothing."""
 
 
-def proposals(cells: MapCells, found: Sequence[Primitive]) -> list[Primitive]:
-    """Rectangles around things in a map that are in no primitive ``found``, the largest first."""
+def proposals(cells: MapCells, found: Sequence[Primitive], most: int = MOST_PROPOSALS) -> list[Primitive]:
+    """Rectangles around things in a map that are in no primitive ``found``, the ``most`` largest."""
     made = []
     middles = np.array([(one.x, one.y) for one in found]).reshape(-1, 2)
     reaches = np.array([circumradius(one) + NEAR for one in found])
@@ -50,7 +50,7 @@ def proposals(cells: MapCells, found: Sequence[Primitive]) -> list[Primitive]:
         if inside.mean() <= COVERED:
             made.append((len(points), around))
     made.sort(key=lambda one: -one[0])
-    return [around for _, around in made[:MOST_PROPOSALS]]
+    return [around for _, around in made[:most]]
 
 
 def blobs(cells: MapCells) -> Iterator[FloatArray]:

@@ -467,15 +467,17 @@ def hits_and_edges(beams: Any, first: int, count: int, r: Any, s: Any, blur: flo
 
 
 @kernel
-def costs(family: int, samples: Any, beams: Any, kinds: Any, sigma: float, table: Any, blur: float, out: Any) -> None:
-    """The negative log-likelihood of all beams for each of many shapes: ``samples`` (M, 5), ``out`` (M,)."""
+def costs(
+    families: Any, samples: Any, beams: Any, kinds: Any, sigma: float, table: Any, blur: float, out: Any
+) -> None:
+    """The negative log-likelihood of all beams for each of many shapes: ``families`` (M,), ``samples`` (M, 5)."""
     r, s = np.empty(BLOCK), np.empty(BLOCK)
     hits, edges = np.empty(BLOCK + 1, np.int64), np.empty(BLOCK + 1, np.int64)
     out[:] = 0.0
     for first in range(0, len(kinds), BLOCK):
         count = min(BLOCK, len(kinds) - first)
         for k in range(len(samples)):
-            meet(family, samples[k], beams, first, count, r, s)
+            meet(families[k], samples[k], beams, first, count, r, s)
             hit, edge, total = hits_and_edges(beams, first, count, r, s, blur, hits, edges)
             for n in range(hit):
                 i = hits[n]
@@ -490,8 +492,8 @@ def costs(family: int, samples: Any, beams: Any, kinds: Any, sigma: float, table
             out[k] -= total
 
 
-@kernel
-def slopes(
+@part
+def slopes_of(
     family: int,
     p: Any,
     beams: Any,
@@ -577,6 +579,22 @@ def curve_of(kind: int, steep: float, x: float, sigma: float) -> float:
     return -steep / (x * sigma) if abs(x) > 1e-6 else 1.0 / (sigma * sigma)
 
 
+@kernel
+def slopes(
+    family: int,
+    p: Any,
+    beams: Any,
+    kinds: Any,
+    sigma: float,
+    table: Any,
+    blur: float,
+    gradient: Any,
+    information: Any,
+) -> float:
+    """As :func:`slopes_of`."""
+    return slopes_of(family, p, beams, kinds, sigma, table, blur, gradient, information)
+
+
 @part
 def solve(matrix: Any, vector: Any, damping: float, out: Any, lower: Any, size: int) -> bool:
     """Solves (matrix + damping diag(matrix)) out = vector by Cholesky's factors; False where there are none."""
@@ -607,9 +625,8 @@ def solve(matrix: Any, vector: Any, damping: float, out: Any, lower: Any, size: 
 
 
 @part
-def project(tie: Any, gradient: Any, full: Any, downhill: Any, information: Any) -> None:
+def project(tie: Any, size: int, gradient: Any, full: Any, downhill: Any, information: Any) -> None:
     """A kind's own downhill direction (K,) and information (K, K), of those of the five parameters."""
-    size = tie.shape[1]
     for k in range(size):
         downhill[k] = 0.0
         for a in range(PARAMETERS):
@@ -622,11 +639,11 @@ def project(tie: Any, gradient: Any, full: Any, downhill: Any, information: Any)
 
 
 @part
-def step_to(p: Any, tie: Any, change: Any, trial: Any) -> None:
+def step_to(p: Any, tie: Any, size: int, change: Any, trial: Any) -> None:
     """Where a change (K,) of a kind's own parameters leads; a size is no more than halved or doubled."""
     for a in range(PARAMETERS):
         trial[a] = p[a]
-        for k in range(tie.shape[1]):
+        for k in range(size):
             trial[a] += tie[a, k] * change[k]
     for a in (WIDTH, HEIGHT):
         trial[a] = min(max(trial[a], 0.5 * p[a], SMALLEST), 2 * p[a], LARGEST)
@@ -634,9 +651,51 @@ def step_to(p: Any, tie: Any, change: Any, trial: Any) -> None:
 
 @kernel
 def descend(
+    families: Any,
+    shapes: Any,
+    ties: Any,
+    sizes: Any,
+    beams: Any,
+    kinds: Any,
+    sigma: float,
+    table: Any,
+    blurs: Any,
+    iterations: int,
+    tolerance: float,
+    known_to: float,
+    cost: Any,
+    information: Any,
+) -> None:
+    """Moves each of some ``shapes`` (M, 5) downhill by Levenberg and Marquardt's steps, one blur after the other.
+
+    ``ties`` (M, 5, 5) map a kind's own parameters, of which there are ``sizes`` (M,), to the five. Leaves the
+    ``cost`` (M,) at the last blur, and the ``information`` (M, 5, 5) on a kind's own parameters, with a blur of
+    ``known_to`` (m) where the last is narrower.
+    """
+    for k in range(len(shapes)):
+        cost[k] = descended(
+            families[k],
+            shapes[k],
+            ties[k],
+            sizes[k],
+            beams,
+            kinds,
+            sigma,
+            table,
+            blurs,
+            iterations,
+            tolerance,
+            known_to,
+            information[k],
+        )
+
+
+@part
+def descended(
     family: int,
     p: Any,
     tie: Any,
+    size: int,
     beams: Any,
     kinds: Any,
     sigma: float,
@@ -647,12 +706,7 @@ def descend(
     known_to: float,
     information: Any,
 ) -> float:
-    """Moves p (5,) downhill by Levenberg and Marquardt's steps, with one blur after the other.
-
-    ``tie`` (5, K) maps a kind's own parameters to the five. Returns the cost at the last blur, and leaves the
-    ``information`` (K, K) on a kind's own parameters, with a blur of ``known_to`` (m) where the last is narrower.
-    """
-    size = tie.shape[1]
+    """As :func:`descend`, of one shape."""
     gradient, full = np.zeros(PARAMETERS), np.zeros((PARAMETERS, PARAMETERS))
     other_gradient, other_full = np.zeros(PARAMETERS), np.zeros((PARAMETERS, PARAMETERS))
     downhill, change, lower = np.zeros(size), np.zeros(size), np.zeros((size, size))
@@ -662,7 +716,7 @@ def descend(
         cost, damping = math.inf, HOPEFUL
         trial[:] = p
         for count in range(iterations + 1):
-            found = slopes(family, trial, beams, kinds, sigma, table, blur, other_gradient, other_full)
+            found = slopes_of(family, trial, beams, kinds, sigma, table, blur, other_gradient, other_full)
             if found < cost:
                 gained = cost - found
                 cost = found
@@ -674,15 +728,15 @@ def descend(
                     break
             else:
                 damping *= 8
-            project(tie, gradient, full, downhill, information)
+            project(tie, size, gradient, full, downhill, information)
             while damping < HOPELESS and not solve(information, downhill, damping, change, lower, size):
                 damping = max(10 * damping, 1e-3)
             if damping > HOPELESS:
                 break
-            step_to(p, tie, change, trial)
+            step_to(p, tie, size, change, trial)
     if blurs[-1] < known_to:
-        slopes(family, p, beams, kinds, sigma, table, known_to, gradient, full)
-    project(tie, gradient, full, downhill, information)
+        slopes_of(family, p, beams, kinds, sigma, table, known_to, gradient, full)
+    project(tie, size, gradient, full, downhill, information)
     return cost
 
 

@@ -39,7 +39,7 @@ from detect.cells import MapCells
 from detect.detector import Detection, Detections, Rejection
 from detect.evidence import weighed
 from detect.measure import CLEARLY, distance_to, first_noise, measured, measured_noise
-from detect.proposals import proposals
+from detect.proposals import MOST_PROPOSALS, proposals
 from detect.raycost import MISS, STOP
 from mapping.grid import OccupancyGrid
 from prim.frames import Pose2D, Scan
@@ -112,32 +112,45 @@ class Refined:
         return self.chances[self.primitive.kind]
 
 
+@dataclass(frozen=True)
+class Pace:
+    """How thoroughly detections are refined; on the way, where a look follows on another, it may be done faster.
+
+    ``before``: what an earlier look at a growing map came to. What was sure of its kind then is fitted on from there,
+    which takes a fraction of the time, and what was missed is not looked for. Without it, that is done in the
+    ``most_proposals`` largest things of the map. ``rounds``: so often all are fitted beside each other.
+    """
+
+    before: Detections | None = None
+    most_proposals: int = MOST_PROPOSALS
+    rounds: int = ROUNDS
+
+
+THOROUGH = Pace()
+
+
 def refine_detections(
     detections: Detections,
     scans: Iterable[tuple[Scan, Pose2D]],
     grid: OccupancyGrid,
     noise_std: float | None = None,
     threads: int = 2,
-    before: Detections | None = None,
-    proposes: bool = True,
+    pace: Pace = THOROUGH,
 ) -> tuple[Detections, float | None]:
     """Detections in ``grid`` refined by the scans that it was made of, and what was missed in it beside them.
 
-    ``noise_std`` (m) is the range noise, where it is known; ``before``, what an earlier look at a growing map came
-    to: what was sure of its kind then is fitted on from there, which takes a fraction of the time. What was missed is
-    only looked for without ``before``, and where one ``proposes``: maps of few scans are full of what might be one.
-    Returns what the rays support, likeliest first, what they do not with the reasons, and the noise: None where no
-    ray passes any.
+    ``noise_std`` (m) is the range noise, where it is known. Returns what the rays support, likeliest first, what they
+    do not with the reasons, and the noise: None where no ray passes any.
     """
-    cells = MapCells.of(grid)
+    cells, before = MapCells.of(grid), pace.before
     unsure = _gone(before, detections) if before else [one for one, _ in detections.doubtful]
     unsure = [one for one in unsure if not cells.hide(one.primitive)]
     guesses = [one.primitive for one in (*detections.found, *unsure)]
-    added = [_proposed(one) for one in proposals(cells, guesses)] if proposes and before is None else []
+    added = [_proposed(one) for one in proposals(cells, guesses, pace.most_proposals)] if before is None else []
     wanted = (*detections.found, *unsure, *added)
     known = _known_before(wanted, before)
     starts = [known.get(number, one).primitive for number, one in enumerate(wanted)]
-    refined, found_std = refine(starts, scans, cells, noise_std, threads, known, len(detections.found))
+    refined, found_std = refine(starts, scans, cells, noise_std, threads, known, len(detections.found), pace.rounds)
     kept: list[Detection] = []
     rejected = []
     for number, (guess, made) in enumerate(zip(wanted, refined, strict=True)):
@@ -224,10 +237,12 @@ def refine(
     threads: int = 2,
     known: Mapping[int, Detection] | None = None,
     preferred: int = 0,
+    rounds: int = ROUNDS,
 ) -> tuple[list[Refined | None], float | None]:
     """Fits primitives to the rays of the scans that a map was made of.
 
-    Those that are ``known``, by their index, are refined already: their kind is not asked for again. Of two that
+    All are fitted beside each other in so many ``rounds``. Those that are ``known``, by their index, are refined
+    already: their kind is not asked for again. Of two that
     stand in one place, the one stays that explains the rays better, the first ``preferred`` ones before others.
     Returns, in the order given, each one refined, or None for one that no ray passes, that another one stands for as
     well, or that is too large or reaches into a wall; and the noise (m), found from the rays where it is not given.
@@ -254,7 +269,7 @@ def refine(
         if not alone:
             return [None] * len(primitives), noise_std
         sensor = Sensor.of(noise_std or measured_noise(alone, sensor), span, most=most)
-        for _ in range(ROUNDS):
+        for _ in range(rounds):
             where = [parameters(one.now) for one in alone]
             changed = look_behind(pool, alone, cells, CLEARED)
             fit_all(pool, alone, changed, sensor)

@@ -251,7 +251,7 @@ class YoloOptions:
 
 YOLO_PRESETS = {
     "prim": YoloOptions(),
-    "more": YoloOptions(epochs=16, learning_rate=0.001),
+    "more": YoloOptions(epochs=5, learning_rate=0.001),
     "transfer": YoloOptions(epochs=8, learning_rate=0.001),
     "paper": YoloOptions(epochs=32, image_size=224, optimizer="SGD", learning_rate=0.01, turn=False),
     "drawings": YoloOptions(epochs=3, mosaic=False, turn=False),
@@ -278,7 +278,7 @@ def train_yolo(data: Path, mapper: str, output: Path, options: YoloOptions) -> P
     _claim(output, {"mapper": mapper, "set": _manifest(data), "options": _plain(asdict(options))})
     best, last = (output / "weights" / name for name in ("best.pt", "last.pt"))
     if options.start is not None and options.start.suffix == ".onnx":
-        options = replace(options, start=_reopened(options.start, data, mapper, output / "start.pt"))
+        options = replace(options, start=_reopened(options.start, data, mapper, output / "start.pt"), trust=True)
     if not (output / FINISHED).exists():
         with fast_arithmetic():
             if not last.exists():

@@ -64,19 +64,17 @@ def walls_behind(cells: MapCells, candidates: Sequence[Primitive], starts: Seque
 
     A wall is seen from the side on which a candidate was first taken to stand: ``starts``.
     """
-    from scipy.spatial import cKDTree  # when it is needed: a replay without refinement starts faster
-
     points = cells.wall_surface
     if not len(points):
         return []
-    surface, places = cKDTree(points), cKDTree([(one.x, one.y) for one in candidates])
+    places = np.array([(one.x, one.y) for one in candidates])
     made = []
     for one, start in zip(candidates, starts, strict=True):
         reach = circumradius(one) + AROUND
-        near = points[surface.query_ball_point((one.x, one.y), reach)]
-        if not is_within(one, near, CLOSE).any():
+        near = points[_around(one, points, reach)]
+        if not is_within(one, near[_around(one, near, circumradius(one) + CLOSE)], CLOSE).any():
             continue
-        for other in places.query_ball_point((one.x, one.y), 2 * reach):
+        for other in np.flatnonzero(_around(one, places, 2 * reach)).tolist():
             near = near[~is_within(candidates[other], near, OWN)]
         for nx, ny, d in find_lines(near, cells.frame.resolution, 2 * LEAST_LENGTH, 2):
             side = 1.0 if nx * start.x + ny * start.y > d else -1.0
@@ -84,6 +82,11 @@ def walls_behind(cells: MapCells, candidates: Sequence[Primitive], starts: Seque
             if wall is not None:
                 made.append(wall)
     return made
+
+
+def _around(one: Primitive, points: FloatArray, reach: float) -> NDArray[np.bool_]:
+    """Which points (N, 2) are no further than ``reach`` (m) from a primitive's middle, along either axis."""
+    return np.asarray((np.abs(points - (one.x, one.y)) <= reach).all(axis=1))
 
 
 def _stretch(cells: MapCells, candidate: Primitive, start: Primitive, line: Line, points: FloatArray) -> Wall | None:

@@ -29,8 +29,10 @@ SCANS_ON_THE_WAY = 60
 ASKED_AGAIN = 4
 """On the way, what was sure of its kind is asked for it again when there are so many times as many scans."""
 
-PROPOSED_FROM = 40
-"""On the way, what the networks missed is looked for when there are so many scans."""
+PROPOSED, PROPOSED_FROM = 6, 40
+"""On the way, what the networks missed is looked for in so many things of the map, from so many scans on: maps of few
+scans are full of what might be one.
+"""
 
 SHIPPED = Path(__file__).parents[1] / "detect" / "shipped"
 """The weights that come with prim: a folder for each mapper."""
@@ -137,7 +139,7 @@ class Lookout:
         On the way some of the scans do, and what was sure of its kind at the last look is asked for it again only
         when there are ASKED_AGAIN times as many scans as when it was asked last.
         """
-        from detect.refine import refine_detections  # when it is needed: a replay without it starts faster
+        from detect.refine import Pace, refine_detections  # when it is needed: a replay without it starts faster
 
         if scans is not None:
             refined, noise_std = refine_detections(detections, scans, grid, self._noise_std, cores())
@@ -145,10 +147,10 @@ class Lookout:
         anew = self._count >= ASKED_AGAIN * self._searched_at
         if anew:
             self._searched_at = self._count
-        before = None if anew else self._before
         some = [part for scan in self._scans for part in scan]
-        proposes = self._count >= PROPOSED_FROM
-        refined, noise_std = refine_detections(detections, some, grid, self._noise_std, cores(), before, proposes)
+        most = PROPOSED if self._count >= PROPOSED_FROM else 0
+        pace = Pace(None if anew else self._before, most, rounds=1)
+        refined, noise_std = refine_detections(detections, some, grid, self._noise_std, cores(), pace)
         self._before = refined
         return self._in_unsure_frame(refined), noise_std
 

@@ -68,7 +68,7 @@ def test_slopes_are_those_of_the_costs(kind: Kind, seed: int) -> None:
     cost = raycost.slopes(FAMILY[kind], p, beams, kinds, 0.1, table, 0.01, gradient, information)
     around = np.concatenate([p + 1e-6 * np.eye(5), p - 1e-6 * np.eye(5), p[None]])
     out = np.empty(len(around))
-    raycost.costs(FAMILY[kind], around, beams, kinds, 0.1, table, 0.01, out)
+    raycost.costs(np.full(len(around), FAMILY[kind]), around, beams, kinds, 0.1, table, 0.01, out)
     assert cost == pytest.approx(out[-1], rel=1e-12)
     scale = np.sqrt(np.diag(information)) + 1
     assert gradient / scale == pytest.approx((out[:5] - out[5:10]) / 2e-6 / scale, abs=0.15)

@@ -17,7 +17,7 @@ from detect.evidence import exact_costs
 from detect.fit import MOMENTS, other_apexes, primitive_of, starts
 from detect.lines import find_lines
 from detect.proposals import proposals
-from detect.refine import Refined, contradiction, refine, refine_detections
+from detect.refine import Pace, Refined, contradiction, refine, refine_detections
 from mapping.grid import GridFrame, OccupancyGrid
 from prim.frames import Pose2D, Scan
 from prim.metrics import polygon_iou
@@ -187,7 +187,7 @@ def test_what_an_earlier_look_found_does_not_vanish(
 ) -> None:
     world, taken, grid = exact
     before, _ = refine_detections(Detections((), ()), taken, grid)
-    after, _ = refine_detections(Detections((found(world.primitives[0]),), ()), taken, grid, before=before)
+    after, _ = refine_detections(Detections((found(world.primitives[0]),), ()), taken, grid, pace=Pace(before))
     assert len(before.found) == len(after.found) == len(world.primitives)
 
 
