@@ -4,9 +4,9 @@
     python -m bench.refine --conditions [--sessions 40] ...       # driven, without walls, 180 and 1000 rays
 
 Sessions that no network was trained on (seeds from 40000), 2 x 2 m, warped, 500 rays, poses exact. All that is found
-counts, no outlier is left out. mAP is of the boxes around refined outlines, by their scores. Peers: OpenCV's contours
-on the same maps (bench/classical.py), and least squares on
-the end points within 10 cm of each true outline, of the true kind: circles (RANSAC, then least squares) and
+counts, no outlier is left out. mAP is of the boxes around refined outlines, as every kind by its chance. Peers:
+OpenCV's contours on the same maps (bench/classical.py), and least squares on the end points within 10 cm of each true
+outline, of the true kind: circles (RANSAC, then least squares) and
 rectangles (the box of least area around them, ends cut by 2 %). OpenCV comes with the extra [train].
 """
 
@@ -29,11 +29,11 @@ from bench.limit import bounds, ratio
 from bench.maps import update
 from bench.sessions import Session, recorded
 from detect.cells import is_within
-from detect.detector import Detection, Detector
+from detect.detector import Detector
 from detect.fit import NAMES
 from detect.refine import refine_detections
 from detect.scores import Marked, score_boxes
-from detect.yolo import KINDS, Boxes
+from detect.trials import marked
 from mapping.mapper import make_mapper
 from prim.metrics import match_primitives
 from prim.raycast import FloatArray
@@ -147,21 +147,6 @@ def outcome(seed: int, noise_std: float, mapper: str, condition: str = "warped")
         (len(peers), len(peer)),
         ended - between,
     )
-
-
-def marked(found: Sequence[Detection], true: Sequence[Primitive]) -> Marked:
-    """The boxes around refined outlines, beside the true ones, in cells of 10 mm."""
-    boxes = np.array([box_around(one.primitive) for one in found], np.float32).reshape(-1, 4)
-    kinds = np.array([KINDS.index(one.primitive.kind) for one in found], np.intp)
-    scores = np.array([one.score for one in found], np.float32)
-    there = np.array([box_around(one) for one in true], np.float32).reshape(-1, 4)
-    return Marked(Boxes(boxes, kinds, scores), there, np.array([KINDS.index(one.kind) for one in true], np.intp))
-
-
-def box_around(primitive: Primitive) -> FloatArray:
-    """Left, top, right, bottom in cells of 10 mm."""
-    outline = 100 * primitive.outline()
-    return np.concatenate((outline.min(axis=0), outline.max(axis=0)))
 
 
 def own_errors(one: Primitive, true: Primitive) -> tuple[float, ...]:

@@ -279,6 +279,16 @@ def every(
 evaluation = typer.Typer(add_completion=False, rich_markup_mode=None)
 
 
+class WayName(StrEnum):
+    """The ways of recording that the shipped weights are measured with."""
+
+    WARPED = "warped"
+    DRIVEN = "driven"
+    NO_WALLS = "no walls"
+    FEW_RAYS = "180 rays"
+    MANY_RAYS = "1000 rays"
+
+
 class SuiteName(StrEnum):
     """The suites of evaluation."""
 
@@ -295,9 +305,15 @@ def _evaluate(
         typer.Option(metavar="FOLDER", help="Of --suite shipped: weights, a folder a mapper. [default: prim's own]"),
     ] = None,
     so_far: Annotated[
-        bool, typer.Option("--so-far", help="Of --suite paper: report what is measured, train nothing.")
+        bool, typer.Option("--so-far", help="Report what has been measured; measure and train nothing.")
     ] = False,
     sessions: Annotated[int, typer.Option(metavar="N", help="Of --suite shipped: sessions a row.", min=1)] = 500,
+    mapper: Annotated[
+        list[MapperName] | None, typer.Option(help="Of --suite shipped: a mapper; repeat. [default: all]")
+    ] = None,
+    recorded: Annotated[
+        list[WayName] | None, typer.Option(help="Of --suite shipped: a way of recording; repeat. [default: all]")
+    ] = None,
     output: Annotated[
         Path | None, typer.Option(metavar="FOLDER", help="Where the report goes. [default: report, in FOLDER]")
     ] = None,
@@ -310,7 +326,9 @@ def _evaluate(
     """Measure the detector. Sets are made where they are missing; an interrupted run goes on.
 
     paper: Tables I and II made again, networks trained as the paper does, its numbers beside ours (hours on two
-    cores); leaves paper.md, paper.csv, paper.png. shipped: weights on fresh sessions; leaves shipped.md, shipped.csv.
+    cores); leaves paper.md, paper.csv, paper.png. shipped: weights, and what refinement makes of them, on fresh
+    sessions (--sessions, --mapper and --recorded choose; the report shows all that has been measured); leaves
+    shipped.md, shipped.csv.
     """
 
     def say(text: str) -> None:
@@ -319,8 +337,9 @@ def _evaluate(
 
     folder = output or work / "report"
     if suite is SuiteName.PAPER:
-        if weights is not None:
-            raise UsageError("--weights goes with --suite shipped")
+        given = {"--weights": weights, "--mapper": mapper, "--recorded": recorded}
+        for name in (name for name, value in given.items() if value is not None):
+            raise UsageError(f"{name} goes with --suite shipped")
         need_extra()
         from detect.suite import Suite
         from detect.tables import report
@@ -328,13 +347,12 @@ def _evaluate(
         made = Suite(work, say)
         written = report(made.measured() if so_far else made.run(), folder)
     else:
-        if so_far:
-            raise UsageError("--so-far goes with --suite paper")
         from detect.suite import ShippedSuite
         from detect.tables import report_shipped
 
-        chosen = weights or Path(__file__).parent / "shipped"
-        written = report_shipped(ShippedSuite(work, chosen, sessions, say).run(), sessions, folder)
+        shipped = ShippedSuite(work, weights or Path(__file__).parent / "shipped", say)
+        mappers, ways = ([one.value for one in chosen] for chosen in (mapper or MapperName, recorded or WayName))
+        written = report_shipped(shipped.measured() if so_far else shipped.run(sessions, mappers, ways), folder)
     for path in written:
         say(f"wrote: {path}")
     return 0

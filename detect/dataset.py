@@ -35,7 +35,7 @@ from prim.frames import Pose2D, Scan, Trajectory
 from prim.log import LogReader
 from prim.messages import POSE_TYPE, SCAN_TOPIC, TRUE_POSE_TOPIC, decode_poses, decode_scan, planar
 from prim.shapes import Kind, Primitive
-from prim.world import Bounds
+from prim.world import Bounds, World
 from recorder.sensors import Lidar
 from recorder.session import SessionOptions, record
 from recorder.world import WorldOptions
@@ -176,16 +176,13 @@ def _done(folder: Path, split: str, seed: int) -> Path:
 def _make_session(folder: Path, options: SetOptions, split: str, seed: int) -> None:
     """Records, maps and cuts one session."""
     session = session_options(options, seed)
-    with tempfile.TemporaryDirectory() as scratch:
-        path = Path(scratch) / "session.mcap"
-        world = record(path, session).world
-        scans = read_scans(path)
+    world, scans = recorded(session)
     x0, y0, x1, y1 = world.bounds
     bounds = (x0 - MARGIN, y0 - MARGIN, x1 + MARGIN, y1 + MARGIN)
     frame = GridFrame.covering(bounds, options.resolution)
     grids = {mapper: map_scans(mapper, scans, options.resolution, frame.bounds) for mapper in options.mappers}
     for number, tile in enumerate(tiles(frame)):
-        held = [primitive for primitive in world.primitives if share_inside(primitive, tile) >= LEAST_INSIDE]
+        held = held_in(tile, world.primitives)
         name = f"{seed:06d}_{number}"
         for mapper, grid in grids.items():
             style = "rounded" if mapper in options.rounded else "grey"
@@ -202,6 +199,13 @@ def _make_session(folder: Path, options: SetOptions, split: str, seed: int) -> N
         }
         (folder / "truth" / split / f"{name}.json").write_text(json.dumps(truth), encoding="utf-8")
     _done(folder, split, seed).touch()
+
+
+def recorded(session: SessionOptions) -> tuple[World, list[tuple[Scan, Pose2D]]]:
+    """A session that is recorded for the purpose: its world, and its scans with the true poses of their laser."""
+    with tempfile.TemporaryDirectory() as scratch:
+        path = Path(scratch) / "session.mcap"
+        return record(path, session).world, read_scans(path)
 
 
 def read_scans(path: Path) -> list[tuple[Scan, Pose2D]]:
@@ -228,6 +232,11 @@ def map_scans(mapper: str, scans: Sequence[tuple[Scan, Pose2D]], resolution: flo
     for scan, pose in scans:
         made.update(scan, pose)
     return made.finish()
+
+
+def held_in(tile: GridFrame, primitives: Sequence[Primitive]) -> tuple[Primitive, ...]:
+    """The primitives that belong to a tile."""
+    return tuple(one for one in primitives if share_inside(one, tile) >= LEAST_INSIDE)
 
 
 def share_inside(primitive: Primitive, tile: GridFrame) -> float:

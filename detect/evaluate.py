@@ -130,9 +130,9 @@ def evaluate(detector: Detector, samples: Sequence[Sample], progress: Progress |
     return Evaluation(
         images=len(samples),
         boxes=score_boxes(marked),
-        true_boxes=_errors(at_truth),
-        detected=_errors(detected),
-        found=_found(len(detected), detections, truths),
+        true_boxes=errors_of(at_truth),
+        detected=errors_of(detected),
+        found=found_rates(len(detected), detections, truths),
         kind_accuracy=right / covered if covered else None,
         yolo_time=float(mean[0]),
         parameters_time=float(mean[1]),
@@ -186,12 +186,12 @@ def _kinds_on_truth(found: Sequence[Detection], sample: Sample) -> list[bool]:
     return right
 
 
-def _found(hits: int, detections: int, truths: int) -> tuple[float, float, float]:
+def found_rates(hits: int, detections: int, truths: int) -> tuple[float, float, float]:
     """Precision, recall, F1."""
     return hits / max(detections, 1), hits / max(truths, 1), 2 * hits / max(detections + truths, 1)
 
 
-def _errors(pairs: Sequence[tuple[Primitive, Primitive]]) -> dict[str, Errors]:
+def errors_of(pairs: Sequence[tuple[Primitive, Primitive]]) -> dict[str, Errors]:
     """Errors of pairs of an estimate and a truth of one kind: for ``all``, and for each kind."""
     if not pairs:
         return {}

@@ -33,7 +33,7 @@ Say = Callable[[str], None]
 
 
 @contextmanager
-def _timed(what: str, say: Say) -> Iterator[None]:
+def timed(what: str, say: Say) -> Iterator[None]:
     """Says how long a part took, where it took a while."""
     began = time.monotonic()
     yield
@@ -46,15 +46,15 @@ def make_start(work: Path, say: Say) -> Path:
     """YOLO's weights after some epochs on drawings, where COCO's would stand: ``work/start``."""
     from detect.train import YOLO_PRESETS, train_yolo
 
-    with _timed("drawings", say):
+    with timed("drawings", say):
         make_drawings(work / NAME, DrawingOptions())
-    with _timed("YOLO on drawings", say):
+    with timed("YOLO on drawings", say):
         return train_yolo(work / NAME, NAME, work / "start", YOLO_PRESETS[NAME])
 
 
 def make_set(folder: Path, options: SetOptions, say: Say) -> Path:
     """A set in a folder of its own."""
-    with _timed(f"{folder.name}: {sum(options.sizes)} sessions", say):
+    with timed(f"{folder.name}: {sum(options.sizes)} sessions", say):
         make(folder, options)
     return folder
 
@@ -80,13 +80,13 @@ def make_weights(
 
     folder.mkdir(parents=True, exist_ok=True)
     style = style_of(data, mapper)
-    with _timed(f"{folder.name}: YOLO", say):
+    with timed(f"{folder.name}: YOLO", say):
         options = replace(YOLO_PRESETS[preset], start=start, trust=True)
         best = train_yolo(data, mapper, folder / "yolo", options)
     for kinds in networks_of(preset, list(Kind)):
         name = "cnn" if len(kinds) == len(Kind) else f"cnn.{'-'.join(kinds)}"
         checkpoint = folder / checkpoint_name(mapper, kinds)
-        with _timed(f"{folder.name}: {name}", say):
+        with timed(f"{folder.name}: {name}", say):
             train_cnn(data, mapper, kinds, checkpoint, replace(CNN_PRESETS[preset], start=cnn_start))
         export_cnn(checkpoint, mapper, folder / f"{name}.onnx", about)
     part = folder / "yolo.part"

@@ -14,18 +14,19 @@ Noise has two readings (DESIGN: n is a share of 5 m as written, of 1 m as the pa
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
 from typing import Any
 
 from detect.dataset import PRESETS, SetOptions, samples
+from detect.dataset import sessions as sessions_of
 from detect.detector import Detector
 from detect.evaluate import evaluate
 from detect.paper import ROWS, Row
 from detect.parameters import PAPER
-from detect.recipe import Say, make_set, make_start, make_weights
+from detect.recipe import Say, make_set, make_start, make_weights, timed
+from detect.trials import trials
 from detect.weights import DETECTOR
 from mapping.mapper import MAPPERS
 from prim.errors import OutputError, UsageError
@@ -165,44 +166,80 @@ class Condition:
         return f"{self.name.replace(' ', '-')}-{self.noise_mm}"
 
 
+WAYS = ("warped", "driven", "no walls", "180 rays", "1000 rays")
+"""The ways of recording."""
+
+
 def conditions(sessions: int) -> Iterator[Condition]:
     """All noise levels on warped sessions, and other ways of recording at three of them."""
     plain = SetOptions(sizes=(0, sessions), seed=300_000)
     for noise_mm in SHIPPED_NOISE:
-        yield Condition("warped", noise_mm, replace(plain, noise_stds=(noise_mm / 1000,)))
-    others: dict[str, dict[str, Any]] = {
-        "driven": {"motions": ("drive",)},
-        "no walls": {"walled": 0.0},
-        "180 rays": {"rays": (180,)},
-        "1000 rays": {"rays": (1000,)},
-    }
-    for name, change in others.items():
+        yield Condition(WAYS[0], noise_mm, replace(plain, noise_stds=(noise_mm / 1000,)))
+    changes: tuple[dict[str, Any], ...] = (
+        {"motions": ("drive",)},
+        {"walled": 0.0},
+        {"rays": (180,)},
+        {"rays": (1000,)},
+    )
+    for name, change in zip(WAYS[1:], changes, strict=True):
         for noise_mm in OTHERS_NOISE:
             yield Condition(name, noise_mm, replace(plain, noise_stds=(noise_mm / 1000,), **change))
+
+
+Measured = tuple[Condition, str, int, dict[str, Any]]
+"""A condition, a mapper, how many sessions were measured, and what detect.trials says of them."""
 
 
 class ShippedSuite:
     """The weights of a folder, one inside it for each mapper, on fresh sessions; ``say`` is told what is done."""
 
-    def __init__(self, work: Path, weights: Path, sessions: int, say: Say) -> None:
-        self.work, self.weights, self.sessions, self.say = work, weights, sessions, say
+    def __init__(self, work: Path, weights: Path, say: Say) -> None:
+        self.work, self.weights, self.say = work, weights, say
 
-    def run(self) -> list[tuple[Condition, str, dict[str, Any]]]:
-        """Makes what is missing; returns each condition with a mapper and the evaluation of its weights.
+    def run(self, sessions: int, mappers: Sequence[str] = MAPPERS, ways: Sequence[str] = ()) -> list[Measured]:
+        """Measures what is missing of so many sessions for each of the ``mappers`` and each of the ``ways`` of
+        recording (all, where none is named); returns all that has been measured.
 
-        Raises UsageError where the folder holds no weights.
+        Raises UsageError where the folder holds no weights, OutputError where a result cannot be written.
         """
-        mappers = [mapper for mapper in MAPPERS if (self.weights / mapper / DETECTOR).exists()]
-        if not mappers:
+        able = [mapper for mapper in mappers if (self.weights / mapper / DETECTOR).exists()]
+        if not able:
             raise UsageError(f"{self.weights} holds no weights: a folder for each mapper is wanted")
+        for mapper in able:
+            for condition in conditions(sessions):
+                if not ways or condition.name in ways:
+                    self._measure(condition, sessions, mapper)
+        return self.measured()
+
+    def _measure(self, condition: Condition, sessions: int, mapper: str) -> None:
+        """Measures one row, unless it was measured with these weights before."""
+        path, weights = self._result(condition, sessions, mapper), self.weights / mapper
+        if path.exists() and path.stat().st_mtime >= (weights / DETECTOR).stat().st_mtime:
+            return
+        with timed(path.stem, self.say):
+            seeds = [seed for _, seed in sessions_of(condition.options)]
+            found = trials(seeds, condition.options, mapper, weights)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        write(path, json.dumps(found, indent=1))
+
+    def measured(self) -> list[Measured]:
+        """What has been measured so far, of each row with most sessions. Raises UsageError where that is nothing."""
         found = []
-        for condition in conditions(self.sessions):
-            for mapper in mappers:
-                path = self.work / "results" / f"{condition.set}.{self.sessions}.{mapper}.json"
-                folder = self.work / f"{condition.set}.{self.sessions}"
-                data = partial(make_set, folder, condition.options, self.say)
-                found.append((condition, mapper, evaluated(path, self.weights / mapper, mapper, data, self.say)))
+        for condition in conditions(1):
+            for mapper in MAPPERS:
+                paths = (self.work / "results").glob(f"{condition.set}.*.{mapper}.json")
+                counts = [int(path.name.split(".")[1]) for path in paths]
+                if counts:
+                    value = read(self._result(condition, max(counts), mapper))
+                    assert value is not None
+                    found.append((condition, mapper, max(counts), value))
+        if not found:
+            raise UsageError(f"nothing has been measured in {self.work} yet")
         return found
+
+    def _result(self, condition: Condition, sessions: int, mapper: str) -> Path:
+        """Where a row is kept."""
+        return self.work / "results" / f"{condition.set}.{sessions}.{mapper}.json"
 
 
 def evaluated(path: Path, networks: Path, mapper: str, data: Callable[[], Path], say: Say) -> dict[str, Any]:

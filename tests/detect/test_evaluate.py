@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import csv
 import json
+import math
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -12,12 +14,15 @@ import pytest
 
 from detect import suite, tables
 from detect.dataset import SetOptions, box_of, make, samples
-from detect.detector import Detector
+from detect.detector import Detection, Detector
 from detect.evaluate import choose_thresholds, evaluate
 from detect.paper import ROWS, SHAPES, TABLE_1, TABLE_2
+from detect.trials import marked, summed_up, trial
 from detect.weights import ALL_KINDS, Card
 from detect.yolo import KINDS
 from prim.errors import UsageError
+from prim.shapes import Kind, Primitive
+from replay.lookout import SHIPPED
 from tests.detect.fakes import constant, weights
 
 OUTPUTS = [1, 0, 0, 0, 0.5] + [1, 0, 0, 0, 0.5, 0.25] + [0, 0, 0.25] + 2 * [1, 0, 0, 0, 0.5, 0.25]
@@ -146,14 +151,66 @@ def test_a_set_with_other_options_is_not_taken(tmp_path: Path) -> None:
         suite.Suite(tmp_path, lambda text: None).tests("test-50")
 
 
+def measured(value: float) -> dict[str, Any]:
+    """What detect.trials says of a row, made up."""
+    boxes = {"boxes": {"all": {"f1": value, "map50": value, "map50_95": value}}, "errors": {}, "found": (1, 1, value)}
+    return {"networks": boxes, "refined": boxes}
+
+
 def test_the_shipped_weights_report(tmp_path: Path) -> None:
-    results = [(condition, "forward", made_up(0.9)) for condition in suite.conditions(500)]
-    markdown, table = tables.report_shipped(results, 500, tmp_path)
-    assert "| warped | 250 | forward | 0.900 | 0.900 | 0.900 | 0.000 | – |" in markdown.read_text()
+    results = [(condition, "forward", 500, measured(0.9)) for condition in suite.conditions(500)]
+    markdown, table = tables.report_shipped(results, tmp_path)
+    assert "| warped | 250 | forward | 500 | 0.900 | 0.900 | 0.900 | 0.900 | 0.900 |" in markdown.read_text()
     lines = list(csv.DictReader(table.open()))
-    assert len(lines) == 7 + 4 * 3 and {line["recorded"] for line in lines} >= {"driven", "no walls", "180 rays"}
+    assert len(lines) == 7 + 4 * 3 and {line["recorded"] for line in lines} == set(suite.WAYS)
+    assert lines[0]["position_mm"] == "" and lines[0]["networks_f1"] == "0.9"
+
+
+def test_the_shipped_suite_measures_what_is_missing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """And reports of each row what was measured with most sessions."""
+    asked: list[tuple[int, str]] = []
+
+    def trials(seeds: list[int], options: object, mapper: str, weights: Path) -> dict[str, Any]:
+        asked.append((len(seeds), mapper))
+        return measured(len(seeds) / 10)
+
+    monkeypatch.setattr(suite, "trials", trials)
+    made = suite.ShippedSuite(tmp_path, SHIPPED, lambda text: None)
+    few = made.run(2, ["forward"], ["driven", "warped"])
+    assert len(few) == 7 + 3 and asked == [(2, "forward")] * 10
+    assert made.run(2, ["forward"], ["driven", "warped"]) == few and len(asked) == 10
+    more = made.run(5, ["det", "forward"], ["driven"])
+    told = {(condition.name, condition.noise_mm, mapper): count for condition, mapper, count, _ in more}
+    assert told["driven", 50, "forward"] == told["driven", 50, "det"] == 5 and told["warped", 0, "forward"] == 2
+    with pytest.raises(UsageError, match="nothing has been measured"):
+        suite.ShippedSuite(tmp_path / "none", SHIPPED, lambda text: None).measured()
+
+
+@pytest.mark.parametrize("mapper", ["det", "forward"])
+def test_a_trial_goes_from_a_seed_to_scores(mapper: str) -> None:
+    """Without noise, what is told is what is there, and refinement makes it more exact."""
+    options = SetOptions(sizes=(0, 1), seed=7, rays=(240,), stops=(6,))
+    alone, refined = trial(7, options, mapper, SHIPPED / mapper)
+    assert alone.truths == refined.truths == len(refined.pairs) > 0
+    assert refined.detections == refined.truths
+    off = [max(math.hypot(a.x - b.x, a.y - b.y) for a, b in told.pairs) for told in (alone, refined)]
+    assert off[1] < 0.001 < off[0]
+    scores = summed_up([refined])
+    assert scores["boxes"]["all"]["map50"] == pytest.approx(1, abs=0.01) and scores["found"] == (1, 1, 1)
+
+
+def test_each_kind_counts_by_its_chance() -> None:
+    square = Primitive(Kind.SQUARE, 0.0, 0.0, 0.0, (0.2,))
+    crop = np.zeros((0, 0), np.uint8)
+    chances = {Kind.RECTANGLE: 0.7, Kind.SQUARE: 0.2995, Kind.CIRCLE: 0.0005}
+    told = Detection(replace(square, kind=Kind.RECTANGLE, size=(0.2, 0.19)), 0.7, (0, 0, 0, 0), crop, None, chances)
+    boxes = marked([told], [square]).boxes
+    assert [KINDS[kind] for kind in boxes.kind] == [Kind.RECTANGLE, Kind.SQUARE]
+    assert boxes.score == pytest.approx([0.7, 0.2995]) and boxes.box[0] == pytest.approx([-10, -9.5, 10, 9.5])
+    alone = marked([replace(told, chances=None)], [square]).boxes
+    assert alone.score == pytest.approx([0.7]) and len(alone) == 1
 
 
 def test_shipped_weights_that_are_not_there(tmp_path: Path) -> None:
     with pytest.raises(UsageError, match="holds no weights"):
-        suite.ShippedSuite(tmp_path, tmp_path, 5, lambda text: None).run()
+        suite.ShippedSuite(tmp_path, tmp_path, lambda text: None).run(5)
