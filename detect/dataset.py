@@ -20,7 +20,7 @@ import os
 import tempfile
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -102,7 +102,10 @@ PRESETS = {
         walled=0.7,
     ),
 }
-"""The paper's sets (III-B, IV-B: 500 and 125 maps, one noise level each, rounded), and one for shipped networks."""
+PRESETS["large"] = replace(PRESETS["mixed"], sizes=(2400, 60), seed=210_000, mappers=("forward",))
+"""The paper's sets (III-B, IV-B: 500 and 125 maps, one noise level each, rounded), one for shipped networks of all
+mappers, and one more for those of forward.
+"""
 
 
 def sessions(options: SetOptions) -> Iterator[tuple[str, int]]:

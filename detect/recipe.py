@@ -20,8 +20,8 @@ from detect.weights import DETECTOR, load_weights
 from detect.yolo import Yolo
 from prim.shapes import Kind
 
-MIXED = PRESETS["mixed"]
-"""What shipped weights are trained on."""
+MIXED, LARGE = PRESETS["mixed"], PRESETS["large"]
+"""What shipped weights are trained on; and the first mapper's go on with."""
 
 WORTH_SAYING = 5.0
 """What takes no longer than this (s) was there already."""
@@ -108,14 +108,21 @@ def put_thresholds(yolo: Path, data: Path) -> None:
 def make_all(work: Path, mappers: Sequence[str], say: Say) -> Iterator[Path]:
     """The weights that come with prim, each mapper's in a folder of its own.
 
-    The first mapper's networks, FIRST's, begin from drawings; the others' from these, since all maps look alike.
+    The first mapper's networks, FIRST's, begin from drawings, and go on with more sessions; the others' begin from
+    the first mapper's, since all maps look alike.
     """
     start, data = make_start(work, say), make_set(work / "mixed", MIXED, say)
-    about = {"sessions": MIXED.sizes[0], "seed": MIXED.seed, "noise_std_m": MIXED.noise_stds}
-    first = make_weights(data, FIRST, work / "weights" / FIRST, "prim", start, say, about)
+    first = make_weights(data, FIRST, work / "first", "prim", start, say, origin(MIXED))
+    yolo, cnn = first / "yolo" / "weights" / "best.pt", first / f"cnn.{FIRST}.pt"
     for mapper in mappers:
         folder = work / "weights" / mapper
-        if mapper != FIRST:
-            yolo, cnn = first / "yolo" / "weights" / "best.pt", first / f"cnn.{FIRST}.pt"
-            make_weights(data, mapper, folder, "transfer", yolo, say, about, cnn)
-        yield folder
+        if mapper == FIRST:
+            more = make_set(work / "large", LARGE, say)
+            yield make_weights(more, mapper, folder, "more", yolo, say, origin(LARGE), cnn)
+        else:
+            yield make_weights(data, mapper, folder, "transfer", yolo, say, origin(MIXED), cnn)
+
+
+def origin(options: SetOptions) -> dict[str, Any]:
+    """What a card tells of the set that a network was trained on."""
+    return {"sessions": options.sizes[0], "seed": options.seed, "noise_std_m": options.noise_stds}

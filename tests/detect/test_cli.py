@@ -12,6 +12,7 @@ from detect import cli
 from detect.tiles import TILE
 from detect.weights import load_weights
 from prim import console
+from replay.lookout import SHIPPED
 
 Run = Callable[..., tuple[int, str, str]]
 
@@ -132,3 +133,8 @@ def test_training_begins_where_it_is_told_to(run: Run) -> None:
     assert outputs.shape == wanted.shape == (2, 9, 1029)
     assert outputs[:, :4] == pytest.approx(wanted[:, :4], abs=0.5)  # cells; weights are kept in half precision
     assert outputs[:, 4:] == pytest.approx(wanted[:, 4:], abs=5e-3)
+
+    # and training goes on from shipped ones, without anything in them being run
+    start = SHIPPED / "det" / "yolo.onnx"
+    code, out, err = run("yolo", "set", "c", "--mapper", "det", "--epochs", 1, "--start", start)
+    assert code == 0 and "wrote: c" in out, err
