@@ -59,7 +59,6 @@ class PresetName(StrEnum):
 
     PRIM = "prim"
     PAPER = "paper"
-    MORE = "more"
 
 
 class YoloPresetName(StrEnum):

@@ -11,6 +11,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
+from shutil import copyfile
 from typing import Any
 
 from detect.dataset import PRESETS, SetOptions, make, samples, style_of
@@ -71,7 +72,8 @@ def make_weights(
 ) -> Path:
     """Trains all networks on a set, with thresholds from its validation split; what is there is not made again.
 
-    ``start`` is what YOLO begins from, ``cnn_start`` the checkpoint that our one CNN begins from, or None.
+    ``start`` is what YOLO begins from, ``cnn_start`` the checkpoint that our one CNN begins from, or None. A preset
+    that is YOLO's alone leaves the CNN as it is.
     """
     if (folder / DETECTOR).exists():
         return folder
@@ -86,9 +88,12 @@ def make_weights(
     for kinds in networks_of(preset, list(Kind)):
         name = "cnn" if len(kinds) == len(Kind) else f"cnn.{'-'.join(kinds)}"
         checkpoint = folder / checkpoint_name(mapper, kinds)
-        with timed(f"{folder.name}: {name}", say):
-            train_cnn(data, mapper, kinds, checkpoint, replace(CNN_PRESETS[preset], start=cnn_start))
-        export_cnn(checkpoint, mapper, folder / f"{name}.onnx", about)
+        if preset in CNN_PRESETS:
+            with timed(f"{folder.name}: {name}", say):
+                train_cnn(data, mapper, kinds, checkpoint, replace(CNN_PRESETS[preset], start=cnn_start))
+            export_cnn(checkpoint, mapper, folder / f"{name}.onnx", about)
+        elif cnn_start is not None:
+            copyfile(cnn_start.with_name(f"{name}.onnx"), folder / f"{name}.onnx")
     part = folder / "yolo.part"
     export_yolo(best, mapper, part, True, style, about)
     put_thresholds(part, data)

@@ -59,12 +59,11 @@ class CnnOptions:
 
 CNN_PRESETS = {
     PRIM.name: CnnOptions(),
-    "more": CnnOptions(epochs=5, learning_rate=0.0005),
     "transfer": CnnOptions(epochs=10, learning_rate=0.0005),
     PAPER.name: CnnOptions(PAPER.name, epochs=20, vary=False),
 }
-"""Ours, from nothing, on from there with more sessions, and from another mapper's network; and the paper's (IV-B: 20
-epochs, batch 128, Adam, learning rate 0.001, the crops as they are)."""
+"""Ours, from nothing and from another mapper's network; and the paper's (IV-B: 20 epochs, batch 128, Adam, learning
+rate 0.001, the crops as they are)."""
 
 
 def networks_of(preset: str, kinds: Sequence[Kind]) -> list[tuple[Kind, ...]]:
