@@ -258,8 +258,9 @@ def test_rays_are_thinned_where_they_are_too_many() -> None:
     scan, pose = scans(room(shape(Kind.CIRCLE)), 0.0, rays=2000, stops=3)[0]
     for _ in range(400):
         gatherer.add(scan, pose)
-    kept = len(gatherer.beams()[0])
-    assert MOST / 2 < kept <= 2 * MOST
+    kept = gatherer.beams()[0]
+    assert MOST / 2 < len(kept) <= 2 * MOST
+    assert len(set(np.diff(np.unique(kept.scan)).tolist())) == 1  # evenly: every fourth scan, or the like
 
 
 def test_behind_a_primitive_stands_what_the_map_and_the_others_say() -> None:
