@@ -39,7 +39,6 @@ bench-forward: .venv/installed
 
 bench-refine: .venv/installed
 	$(BIN)/python -m bench.refine --update docs/refine.md --short README.md
-	$(BIN)/python -m bench.refine --conditions --sessions 40 --update docs/refine.md
 	$(BIN)/python -m bench.tracks --update docs/detect.md
 
 bench-poses: .venv/installed

@@ -1,7 +1,6 @@
 """Refinement on recorded sessions, from real detections: errors, error bars, the limit, kinds, time, and peers.
 
     python -m bench.refine [--sessions 200] [--mapper forward] [--noise 0.05 0.25 0.5] [--update docs/refine.md]
-    python -m bench.refine --conditions [--sessions 40] ...       # driven, without walls, 180 and 1000 rays
 
 Sessions that no network was trained on (seeds from 40000), 2 x 2 m, warped, 500 rays, poses exact. All that is found
 counts, no outlier is left out. mAP is of the boxes around refined outlines, as every kind by its chance. Peers:
@@ -18,7 +17,7 @@ import os
 import time
 from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
@@ -40,7 +39,6 @@ from prim.raycast import FloatArray
 from prim.shapes import Kind, Primitive, angle_difference, angle_error
 from recorder.sensors import Lidar
 from recorder.session import SessionOptions
-from recorder.world import WorldOptions
 from replay.lookout import SHIPPED
 
 FIRST_SEED = 40_000
@@ -81,21 +79,9 @@ class Outcome:
     refine_s: float
 
 
-CONDITIONS: dict[str, SessionOptions] = {
-    "warped": SessionOptions(),
-    "driven": SessionOptions(motion="drive", duration=40.0, rate=5.0),
-    "no walls": SessionOptions(world=WorldOptions(walls=False)),
-    "180 rays": SessionOptions(lidar=Lidar(rays=180)),
-    "1000 rays": SessionOptions(lidar=Lidar(rays=1000)),
-}
-"""Ways of recording."""
-
-
-def outcome(seed: int, noise_std: float, mapper: str, condition: str = "warped") -> Outcome:
+def outcome(seed: int, noise_std: float, mapper: str) -> Outcome:
     """Records a session, maps it, detects, refines, and holds all against the truth."""
-    options = CONDITIONS[condition]
-    lidar = replace(options.lidar, noise_std=noise_std)
-    session = recorded(replace(options, seed=seed, lidar=lidar))
+    session = recorded(SessionOptions(seed=seed, lidar=Lidar(noise_std=noise_std)))
     made = make_mapper(mapper, 0.01, session.frame.bounds)
     for scan, pose in session.scans:
         made.keep(scan, pose)
@@ -110,8 +96,7 @@ def outcome(seed: int, noise_std: float, mapper: str, condition: str = "warped")
     pairs = {pair.truth: pair for pair in match_primitives(primitives, session.primitives)}
     peer = classical.detect(grid)
     peers = {pair.truth: pair for pair in match_primitives(peer, session.primitives) if pair.found}
-    walls = ARENA if options.world.walls else np.zeros((0, 4))
-    limits = bounds(session.scans, session.primitives, walls, max(noise_std, 1e-3))
+    limits = bounds(session.scans, session.primitives, ARENA, max(noise_std, 1e-3))
     rows = []
     for k, true in enumerate(session.primitives):
         pair = pairs.get(k)
@@ -290,15 +275,13 @@ def main() -> None:
     parser.add_argument("--mapper", default="forward")
     parser.add_argument("--noise", type=float, nargs="+", default=[0.05, 0.25, 0.5])
     parser.add_argument("--workers", type=int, default=os.cpu_count())
-    parser.add_argument("--conditions", action="store_true", help="other ways of recording, in the place of peers")
     parser.add_argument("--update", type=Path, help="the document that gets the tables")
     parser.add_argument("--short", type=Path, help="the document that gets the short one")
     options = parser.parse_args()
     with ProcessPoolExecutor(options.workers) as pool:
-        content = (conditions_tables if options.conditions else tables)(pool, options)
+        content = tables(pool, options)
     if options.update:
-        name = "conditions" if options.conditions else "refine"
-        update(options.update, f"{name} {options.mapper}", content)
+        update(options.update, f"refine {options.mapper}", content)
     if options.short:
         update(options.short, "refine short", short(content))
 
@@ -316,12 +299,10 @@ HEAD = [
 ]
 
 
-def sessions(
-    pool: ProcessPoolExecutor, options: argparse.Namespace, noise_std: float, condition: str = "warped"
-) -> list[Outcome]:
+def sessions(pool: ProcessPoolExecutor, options: argparse.Namespace, noise_std: float) -> list[Outcome]:
     """The outcomes of all seeds."""
     seeds = range(options.first_seed, options.first_seed + options.sessions)
-    return list(pool.map(partial(outcome, noise_std=noise_std, mapper=options.mapper, condition=condition), seeds))
+    return list(pool.map(partial(outcome, noise_std=noise_std, mapper=options.mapper), seeds))
 
 
 def tables(pool: ProcessPoolExecutor, options: argparse.Namespace) -> str:
@@ -336,17 +317,6 @@ def tables(pool: ProcessPoolExecutor, options: argparse.Namespace) -> str:
         peers.append(peers_table(noise_std, of))
         print(errors[-1], *limits[-5:], peers[-1], sep="\n", flush=True)
     return "\n".join([*errors, "", *limits, "", *peers])
-
-
-def conditions_tables(pool: ProcessPoolExecutor, options: argparse.Namespace) -> str:
-    """Errors for each way of recording and noise level."""
-    rows = ["| recorded | " + HEAD[0], "|---" + HEAD[1]]
-    for condition in CONDITIONS:
-        for noise_std in options.noise:
-            of = sessions(pool, options, noise_std, condition)
-            rows.append(quality(f"{condition}, {1000 * noise_std:g} mm", of))
-            print(rows[-1], flush=True)
-    return "\n".join(rows)
 
 
 if __name__ == "__main__":
