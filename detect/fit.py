@@ -220,7 +220,7 @@ def _fit_each(ways: Sequence[Way], share: Share, sensor: Sensor, how: Descent) -
         share.beams.kinds,
         sensor.std,
         sensor.table,
-        np.maximum(how.blurs, sensor.footprint),
+        np.array(list(dict.fromkeys(max(blur, sensor.footprint) for blur in how.blurs))),
         how.steps,
         how.tolerance / share.each,
         max(KNOWN_TO, sensor.footprint),
