@@ -41,7 +41,7 @@ ORIGIN_X, ORIGIN_Y, DIRECTION_X, DIRECTION_Y, RANGE, STOP, MISS = range(7)
 """Rows of beams (7, N): the ray; the measured range, or the limit it is beyond; from where on (m) something else
 stops it; the logarithm of its likelihood if it misses the shape."""
 
-NEAR, FARTHEST = 7, 8
+NEAR, LIMIT = 7, 8
 ROWS = 9
 """Rows that beams have besides while they are collected: from where on (m) they are near, the largest range (m)."""
 
@@ -372,7 +372,7 @@ def keep_passing(
         if abs(dx * away_y - dy * away_x) < reach and ahead > -reach and kinds[i] != SAYS_NOTHING:
             rays[ORIGIN_X, size], rays[ORIGIN_Y, size] = pose[0], pose[1]
             rays[DIRECTION_X, size], rays[DIRECTION_Y, size] = dx, dy
-            rays[RANGE, size], rays[NEAR, size], rays[FARTHEST, size] = z[i], ahead - reach, of_scan[0]
+            rays[RANGE, size], rays[NEAR, size], rays[LIMIT, size] = z[i], ahead - reach, of_scan[0]
             ray_kinds[size], scan[size] = kinds[i], of_scan[1]
             size += 1
     return size
@@ -492,8 +492,7 @@ def costs(
             out[k] -= total
 
 
-@part
-def slopes_of(
+def _slopes(
     family: int,
     p: Any,
     beams: Any,
@@ -559,6 +558,10 @@ def slopes_of(
     return -total
 
 
+slopes_of, slopes = part(_slopes), kernel(_slopes)
+"""The same, for kernels to be made of, and as a kernel."""
+
+
 @part
 def summed(weight: Any, one: Any, other: Any, count: int, both: bool) -> float:
     """The sum of ``weight`` times ``one``, and times ``other`` where ``both`` count."""
@@ -577,22 +580,6 @@ def curve_of(kind: int, steep: float, x: float, sigma: float) -> float:
     if kind != MEASURED:
         return steep * steep
     return -steep / (x * sigma) if abs(x) > 1e-6 else 1.0 / (sigma * sigma)
-
-
-@kernel
-def slopes(
-    family: int,
-    p: Any,
-    beams: Any,
-    kinds: Any,
-    sigma: float,
-    table: Any,
-    blur: float,
-    gradient: Any,
-    information: Any,
-) -> float:
-    """As :func:`slopes_of`."""
-    return slopes_of(family, p, beams, kinds, sigma, table, blur, gradient, information)
 
 
 @part

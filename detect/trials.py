@@ -6,8 +6,7 @@ refined is measured alike: every primitive that the rays support counts as each 
 
 from __future__ import annotations
 
-import os
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import asdict, dataclass
 from functools import lru_cache, partial
@@ -23,6 +22,7 @@ from detect.refine import refine_detections
 from detect.scores import Marked, score_boxes
 from detect.tiles import cut, tiles
 from detect.yolo import KINDS, Boxes
+from mapping.forward import cores
 from mapping.grid import GridFrame
 from prim.metrics import match_primitives
 from prim.raycast import FloatArray
@@ -71,20 +71,14 @@ def trial(seed: int, options: SetOptions, mapper: str, weights: Path) -> tuple[T
     )
 
 
-def trials(
-    seeds: Sequence[int], options: SetOptions, mapper: str, weights: Path, done: Callable[[], None] | None = None
-) -> dict[str, Any]:
+def trials(seeds: Sequence[int], options: SetOptions, mapper: str, weights: Path) -> dict[str, Any]:
     """All sessions, on all cores: what the ``networks`` alone are worth, and what is ``refined``; as it is kept.
 
     Each holds ``boxes`` (as detect.scores.Scores) and ``errors`` (as detect.evaluate.Errors) of all kinds and of
-    each, and ``found``: precision, recall and F1. ``done`` is called after each session.
+    each, and ``found``: precision, recall and F1.
     """
-    told: list[tuple[Told, Told]] = []
-    with ProcessPoolExecutor(len(os.sched_getaffinity(0))) as pool:
-        for one in pool.map(partial(trial, options=options, mapper=mapper, weights=weights), seeds, chunksize=4):
-            told.append(one)
-            if done:
-                done()
+    with ProcessPoolExecutor(cores()) as pool:
+        told = list(pool.map(partial(trial, options=options, mapper=mapper, weights=weights), seeds, chunksize=4))
     return {name: summed_up(own) for name, own in zip(("networks", "refined"), zip(*told, strict=True), strict=True)}
 
 
