@@ -41,7 +41,7 @@ bench-refine: .venv/installed
 	$(BIN)/python -m bench.refine --update docs/refine.md --short README.md
 	$(BIN)/python -m bench.tracks --update docs/detect.md
 
-bench-poses: .venv/installed
+bench-poses: .venv/installed-dev
 	$(BIN)/python -m bench.poses --sessions 12 --update docs/poses.md
 	$(BIN)/python -m bench.poses fusion --sessions 50 --update docs/poses.md
 

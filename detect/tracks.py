@@ -1,8 +1,10 @@
 """Detections over a replay become tracks: one id for one primitive, as long as it is seen.
 
-Each track holds a Kalman filter (filterpy) for every kind it was taken for: place, angle where the kind has one, and
-sizes, with a state that stays where it is but for a little process noise. The track's kind is the one with the
-largest sum of scores. What belongs together is decided by distance, nearest first.
+Each track holds a Kalman filter for every kind it was taken for: place, angle where the kind has one, and sizes, with
+a state that stays where it is but for a little process noise. No look tells how the errors of two of these go
+together, so that all covariances are diagonal and each number has a filter of its own (the tests hold them against
+filterpy's, which takes longer to load than a short replay to map). The track's kind is the one with the largest sum
+of scores. What belongs together is decided by distance, nearest first.
 
 Rules, all counted in looks (a look is one time that the detector was shown the map):
 
@@ -17,11 +19,11 @@ import math
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
+from prim.raycast import FloatArray
 from prim.shapes import SIZE_KEYS, Kind, Primitive, angle_difference
 
 if TYPE_CHECKING:
@@ -46,47 +48,46 @@ DRIFT = 0.3
 """Process noise between two looks, as a share of the above: looks at one growing map err alike, and things move."""
 
 
+LEAST_SCORE = 0.05
+"""A sighting is as unsure as if it were seen with its score, or this if that is more, times as many rays."""
+
+
 @dataclass
 class _Hypothesis:
-    """What a track is if it is of one kind: the filter's state is x, y, angle where there is one, sizes."""
+    """What a track is if it is of one kind: the ``state`` (K,) is x, y, angle where there is one, sizes; ``variance``
+    (K,) is how unsure each of them is (m², rad²).
+    """
 
     kind: Kind
-    filter: Any
+    state: FloatArray
+    variance: FloatArray
     score: float = 0.0
 
     @classmethod
     def begin(cls, detection: Detection) -> _Hypothesis:
         """From the first sighting."""
-        from filterpy.kalman import KalmanFilter
-
         primitive = detection.primitive
-        state = _state(primitive)
-        noise = _noise(detection)
-        made = KalmanFilter(dim_x=len(state), dim_z=len(state))
-        made.x, made.P = state[:, None], noise.copy()
-        made.F = made.H = np.eye(len(state))
-        made.R, made.Q = noise, noise * DRIFT**2
-        return cls(primitive.kind, made, detection.score)
+        return cls(primitive.kind, _state(primitive), _noise(detection), detection.score)
 
     def update(self, detection: Detection) -> None:
         """Adds a sighting; its angle is taken on the turn that is nearest to the state's."""
         primitive = detection.primitive
         seen = _state(primitive)
         if primitive.theta is not None:
-            held = self.primitive
-            period = primitive.symmetry or held.symmetry
-            seen[2] = self.filter.x[2, 0] + (
-                0.0 if period is None else angle_difference(seen[2], self.filter.x[2, 0], period)
-            )
+            period = primitive.symmetry or self.primitive.symmetry
+            turned = 0.0 if period is None else angle_difference(seen[2], self.state[2], period)
+            seen[2] = self.state[2] + turned
         noise = _noise(detection)
-        self.filter.predict(Q=noise * DRIFT**2)
-        self.filter.update(seen[:, None], R=noise / max(detection.score, 0.05))
+        predicted = self.variance + noise * DRIFT**2
+        gain = predicted / (predicted + noise / max(detection.score, LEAST_SCORE))
+        self.state = self.state + gain * (seen - self.state)
+        self.variance = (1 - gain) * predicted
         self.score += detection.score
 
     @property
     def primitive(self) -> Primitive:
         """The state as a primitive."""
-        values = self.filter.x[:, 0].tolist()
+        values = self.state.tolist()
         theta = None if self.kind is Kind.CIRCLE else values[2]
         sizes = values[len(values) - len(SIZE_KEYS[self.kind]) :]
         return Primitive(self.kind, values[0], values[1], theta, tuple(max(v, 1e-3) for v in sizes)).canonical()
@@ -95,7 +96,7 @@ class _Hypothesis:
     def std(self) -> dict[str, float]:
         """Standard deviations (m, rad) by name."""
         names = ["x", "y", *([] if self.kind is Kind.CIRCLE else ["theta"]), *SIZE_KEYS[self.kind]]
-        return dict(zip(names, np.sqrt(np.diag(self.filter.P)).tolist(), strict=True))
+        return dict(zip(names, np.sqrt(self.variance).tolist(), strict=True))
 
 
 @dataclass
@@ -195,15 +196,15 @@ def _gate(a: Primitive, b: Primitive) -> float:
     return max(LEAST_GATE, GATE * extent)
 
 
-def _state(primitive: Primitive) -> NDArray[np.float64]:
+def _state(primitive: Primitive) -> FloatArray:
     turn = [] if primitive.theta is None else [primitive.theta]
     return np.array([primitive.x, primitive.y, *turn, *primitive.size])
 
 
-def _noise(detection: Detection) -> NDArray[np.float64]:
-    """Covariance of one sighting: its own where it was refined, else what networks' errors are."""
+def _noise(detection: Detection) -> FloatArray:
+    """Variances (K,) of one sighting: its own where it was refined, else what networks' errors are."""
     primitive = detection.primitive
     if detection.std is not None:
-        return np.diag(np.square(list(detection.std.values())) + LEAST_STD**2)
+        return np.square(list(detection.std.values())) + LEAST_STD**2
     turn = [] if primitive.theta is None else [ANGLE_STD]
-    return np.diag(np.square([PLACE_STD, PLACE_STD, *turn, *[SIZE_STD] * len(primitive.size)]))
+    return np.square([PLACE_STD, PLACE_STD, *turn, *[SIZE_STD] * len(primitive.size)])

@@ -7,10 +7,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from filterpy.kalman import KalmanFilter
 
 from detect.detector import Detection
-from detect.tracks import CONFIRM, DROP, Tracker
-from prim.shapes import Kind, Primitive, angle_error
+from detect.tracks import CONFIRM, DRIFT, DROP, LEAST_STD, Tracker
+from prim.raycast import FloatArray
+from prim.shapes import Kind, Primitive, angle_difference, angle_error
 
 CROP = np.zeros((1, 1), np.uint8)
 SHAPES = [
@@ -48,6 +50,43 @@ def test_a_track_is_better_than_its_sightings(shape: Primitive) -> None:
     assert (angle_error(held, shape) or 0.0) <= max(np.mean(angles), 1e-9)
     assert set(track.std) == {"x", "y", *(["theta"] if shape.theta is not None else []), *shape.sizes}
     assert 0 < track.std["x"] < 0.012
+
+
+@pytest.mark.parametrize("shape", SHAPES, ids=lambda shape: shape.kind)
+def test_the_filter_does_what_filterpys_does(shape: Primitive) -> None:
+    """Over sightings of every score and sureness, angles taken on the turn that is nearest to the state's."""
+    rng, tracker = np.random.default_rng(5), Tracker()
+    other = KalmanFilter(dim_x=len(vector(shape)), dim_z=len(vector(shape)))
+    other.F = other.H = np.eye(other.dim_x)
+    for look in range(12):
+        one, score = shaken(shape, rng), rng.uniform(0.01, 1)
+        std = dict(zip(tracker_names(shape), rng.uniform(0.001, 0.03, other.dim_x), strict=True))
+        (track,) = tracker.update([Detection(one, score, (0, 0, 0, 0), CROP, std)])
+        noise, values = np.diag(np.square(list(std.values())) + LEAST_STD**2), vector(one)
+        if look == 0:
+            other.x, other.P = values[:, None], noise
+            continue
+        if one.theta is not None:
+            held = other.x[2, 0]
+            values[2] = held + (0.0 if one.symmetry is None else angle_difference(values[2], held, one.symmetry))
+        other.predict(Q=noise * DRIFT**2)
+        other.update(values[:, None], R=noise / max(score, 0.05))
+    held = Primitive(shape.kind, *other.x[:2, 0], *split(shape, other.x[2:, 0])).canonical()
+    assert vector(track.primitive) == pytest.approx(vector(held), abs=1e-9)
+    assert list(track.std.values()) == pytest.approx(np.sqrt(np.diag(other.P)), abs=1e-9)
+
+
+def vector(shape: Primitive) -> FloatArray:
+    return np.array([shape.x, shape.y, *([] if shape.theta is None else [shape.theta]), *shape.size])
+
+
+def split(shape: Primitive, rest: FloatArray) -> tuple[float | None, tuple[float, ...]]:
+    values = rest.tolist()
+    return (None, tuple(values)) if shape.theta is None else (values[0], tuple(values[1:]))
+
+
+def tracker_names(shape: Primitive) -> list[str]:
+    return ["x", "y", *([] if shape.theta is None else ["theta"]), *shape.sizes]
 
 
 def test_ids_stay_whatever_the_order() -> None:

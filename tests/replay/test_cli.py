@@ -79,20 +79,22 @@ def test_a_plain_replay_leaves_a_recording_and_a_report(replay: Run, noisy_sessi
 
 
 @pytest.mark.parametrize(
-    ("option", "heavy"),
+    ("options", "heavy", "files"),
     [
-        ("--quiet", {"rerun", "torch", "ultralytics", "matplotlib", "filterpy"}),
         (
-            "--quiet --no-detect",
-            {"rerun", "torch", "ultralytics", "matplotlib", "filterpy", "shapely", "onnxruntime"},
+            "--detect-every 20",
+            {"torch", "ultralytics", "matplotlib", "filterpy", "scipy.stats"},
+            {"report.json", "rrd"},
         ),
+        ("--no-viewer", {"rerun", "torch", "ultralytics", "matplotlib"}, {"report.json"}),
+        ("--no-viewer --no-detect", {"rerun", "torch", "matplotlib", "shapely", "onnxruntime"}, {"report.json"}),
     ],
 )
-def test_no_viewer_writes_no_recording_and_imports_no_rerun(
-    noisy_session: Session, tmp_path: Path, option: str, heavy: set[str]
+def test_what_is_not_asked_for_is_neither_loaded_nor_written(
+    noisy_session: Session, tmp_path: Path, options: str, heavy: set[str], files: set[str]
 ) -> None:
     code = (
-        f"import sys; from replay.cli import main; sys.argv[2:] = '--no-viewer {option}'.split()\n"
+        f"import sys; from replay.cli import main; sys.argv[2:] = '--quiet {options}'.split()\n"
         "try: main()\nexcept SystemExit as stop: assert not stop.code, stop.code\n"
         f"bad = {heavy} & set(sys.modules)\n"
         "assert not bad, bad"
@@ -101,7 +103,7 @@ def test_no_viewer_writes_no_recording_and_imports_no_rerun(
         [sys.executable, "-c", code, noisy_session.path], cwd=tmp_path, capture_output=True, check=False
     )
     assert (done.returncode, done.stdout, done.stderr) == (0, b"", b"")
-    assert [path.name for path in tmp_path.iterdir()] == ["noisy.prob.report.json"]
+    assert {path.name for path in tmp_path.iterdir()} == {f"noisy.prob.{ending}" for ending in files}
 
 
 def test_help_and_version_load_nothing_heavy() -> None:
