@@ -107,6 +107,8 @@ def load_weights(path: Path, stage: str, mapper: str | None = None, threads: int
         raise WeightsError(f"{path} is a pickle, which can run code: make an ONNX file of it with prim-train export")
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = threads or len(os.sched_getaffinity(0))
+    # Threads that wait for a network in a loop take the cores from what runs beside it.
+    options.add_session_config_entry("session.intra_op.allow_spinning", "0")
     options.log_severity_level = 4
     try:
         session = onnxruntime.InferenceSession(content, options, providers=["CPUExecutionProvider"])
