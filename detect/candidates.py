@@ -37,7 +37,7 @@ SAME_NOISE = 0.03
 
 @dataclass
 class Candidate:
-    """One thing that is fitted: where it was first seen, the rays around it, and what is known of it by now."""
+    """One thing that is fitted: where it was first seen, the rays around it, and what is known of it by ``now``."""
 
     start: Primitive
     beams: Beams
@@ -48,6 +48,10 @@ class Candidate:
     fits: list[Fit] = field(default_factory=list)
     fitted_to: tuple[Sensor, Beams] | None = None
     said: tuple[Backdrop, float, FloatArray] | None = None
+    now: Primitive = field(init=False)
+
+    def __post_init__(self) -> None:
+        self.now = self.start
 
     def seen_before(self, others: Sequence[Candidate], sensor: Sensor) -> Beams:
         """Its beams, with what they say where they miss it: of the map, of walls, and of the other candidates."""
@@ -77,10 +81,10 @@ class Candidate:
         own = (wall for wall in self.walls if wall.behind is self.start)
         return not self.cells.is_pierced_by(primitive) and not any(wall.is_cut_by(primitive) for wall in own)
 
-    @property
-    def now(self) -> Primitive:
-        """The best that is known of it."""
-        return primitive_of(self.fits[0].kind, self.fits[0].p) if self.fits else self.start
+    def take(self, fits: list[Fit], to: Beams, by: Sensor) -> None:
+        """Holds these fits to some beams for what is known of it, the first of them for the best."""
+        self.fits, self.fitted_to = fits, (by, to)
+        self.now = primitive_of(fits[0].kind, fits[0].p)
 
 
 def fit_all(pool: Executor, candidates: Sequence[Candidate], anew: Sequence[bool], sensor: Sensor) -> None:
@@ -108,8 +112,8 @@ def _fit_one(candidate: Candidate, beams: Beams, sensor: Sensor, anew: bool) -> 
     ordered = sorted(possible or fits, key=lambda fit: -laplace(fit))
     least = laplace(ordered[0]) - OUT_OF_QUESTION * sensor.dispersion
     likely = {fit.kind for fit in ordered if laplace(fit) > least}
-    candidate.fits = [fit for fit in ordered if fit.kind in likely | {SIMPLER.get(kind) for kind in likely}]
-    candidate.fitted_to = sensor, beams
+    likely |= {SIMPLER[kind] for kind in likely if kind in SIMPLER}
+    candidate.take([fit for fit in ordered if fit.kind in likely], beams, sensor)
 
 
 def _much_alike(one: Sensor, other: Sensor) -> bool:

@@ -116,12 +116,13 @@ class Refined:
 class Pace:
     """How thoroughly detections are refined; on the way, where a look follows on another, it may be done faster.
 
-    ``before``: what an earlier look at a growing map came to. What was sure of its kind then is fitted on from there,
-    which takes a fraction of the time, and what was missed is not looked for. Without it, that is done in the
-    ``most_proposals`` largest things of the map. ``rounds``: so often all are fitted beside each other.
+    ``before``: what an earlier look at a growing map came to, with the noise (m) that it found. What was sure of its
+    kind then is fitted on from there, which takes a fraction of the time, and what was missed is not looked for.
+    Without it, that is done in the ``most_proposals`` largest things of the map. ``rounds``: so often all are fitted
+    beside each other, once they are told apart.
     """
 
-    before: Detections | None = None
+    before: tuple[Detections, float | None] | None = None
     most_proposals: int = MOST_PROPOSALS
     rounds: int = ROUNDS
 
@@ -142,7 +143,8 @@ def refine_detections(
     ``noise_std`` (m) is the range noise, where it is known. Returns what the rays support, likeliest first, what they
     do not with the reasons, and the noise: None where no ray passes any.
     """
-    cells, before = MapCells.of(grid), pace.before
+    cells = MapCells.of(grid)
+    before, guess_std = pace.before or (None, None)
     unsure = _gone(before, detections) if before else [one for one, _ in detections.doubtful]
     unsure = [one for one in unsure if not cells.hide(one.primitive)]
     guesses = [one.primitive for one in (*detections.found, *unsure)]
@@ -150,7 +152,9 @@ def refine_detections(
     wanted = (*detections.found, *unsure, *added)
     known = _known_before(wanted, before)
     starts = [known.get(number, one).primitive for number, one in enumerate(wanted)]
-    refined, found_std = refine(starts, scans, cells, noise_std, threads, known, len(detections.found), pace.rounds)
+    refined, found_std = refine(
+        starts, scans, cells, noise_std, threads, known, len(detections.found), pace.rounds, guess_std
+    )
     kept: list[Detection] = []
     rejected = []
     for number, (guess, made) in enumerate(zip(wanted, refined, strict=True)):
@@ -238,12 +242,14 @@ def refine(
     known: Mapping[int, Detection] | None = None,
     preferred: int = 0,
     rounds: int = ROUNDS,
+    guess_std: float | None = None,
 ) -> tuple[list[Refined | None], float | None]:
     """Fits primitives to the rays of the scans that a map was made of.
 
     All are fitted beside each other in so many ``rounds``. Those that are ``known``, by their index, are refined
-    already: their kind is not asked for again. Of two that
-    stand in one place, the one stays that explains the rays better, the first ``preferred`` ones before others.
+    already: their kind is not asked for again. Of two that stand in one place, the one stays that explains the rays
+    better, the first ``preferred`` ones before others. The noise (m) is ``noise_std`` where it is known, else it is
+    found from the rays, which begins with ``guess_std`` where that is given.
     Returns, in the order given, each one refined, or None for one that no ray passes, that another one stands for as
     well, or that is too large or reaches into a wall; and the noise (m), found from the rays where it is not given.
     """
@@ -258,7 +264,7 @@ def refine(
     seen = [one for one in candidates if len(one.beams)]
     if not seen:
         return [None] * len(primitives), noise_std
-    sensor = Sensor.of(noise_std or min(first_noise(seen), most), span, most=most)
+    sensor = Sensor.of(noise_std or min(guess_std or first_noise(seen), most), span, most=most)
     with ThreadPoolExecutor(threads) as pool:
         look_behind(pool, seen, cells, CLEARED_FIRST)
         fit_all(pool, seen, [True] * len(seen), sensor)

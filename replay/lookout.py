@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from detect.detector import Detections, Detector
     from detect.tracks import Tracker
 
-SCANS_ON_THE_WAY = 60
+SCANS_ON_THE_WAY = 30
 """A look on the way is refined by so many of the scans to twice as many, evenly spread."""
 
 ASKED_AGAIN = 4
@@ -88,7 +88,7 @@ class Lookout:
         self._frame_covariance = frame_covariance
         self._scans: list[list[tuple[Scan, Pose2D]]] = []
         self._keeps = False
-        self._before: Detections | None = None
+        self._before: tuple[Detections, float | None] | None = None
         self._count, self._stride = 0, 1
         self._searched_at = 0
         self.refines = refines
@@ -149,9 +149,9 @@ class Lookout:
             self._searched_at = self._count
         some = [part for scan in self._scans for part in scan]
         most = PROPOSED if self._count >= PROPOSED_FROM else 0
-        pace = Pace(None if anew else self._before, most, rounds=1)
+        pace = Pace(None if anew else self._before, most, rounds=0)
         refined, noise_std = refine_detections(detections, some, grid, self._noise_std, cores(), pace)
-        self._before = refined
+        self._before = refined, noise_std
         return self._in_unsure_frame(refined), noise_std
 
     def _in_unsure_frame(self, detections: Detections) -> Detections:

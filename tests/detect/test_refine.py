@@ -186,8 +186,9 @@ def test_what_an_earlier_look_found_does_not_vanish(
     exact: tuple[World, list[tuple[Scan, Pose2D]], OccupancyGrid],
 ) -> None:
     world, taken, grid = exact
-    before, _ = refine_detections(Detections((), ()), taken, grid)
-    after, _ = refine_detections(Detections((found(world.primitives[0]),), ()), taken, grid, pace=Pace(before))
+    before, noise_std = refine_detections(Detections((), ()), taken, grid)
+    pace = Pace((before, noise_std))
+    after, _ = refine_detections(Detections((found(world.primitives[0]),), ()), taken, grid, pace=pace)
     assert len(before.found) == len(after.found) == len(world.primitives)
 
 
