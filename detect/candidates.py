@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from detect.beams import Backdrop, Beams, Obstacles, Sensor, backdrop, before, map_says, parameters
 from detect.cells import MapCells, circumradius
 from detect.detector import Detection
-from detect.evidence import laplace
+from detect.evidence import laplace, longest
 from detect.fit import SIMPLER, TIES, Fit, again, primitive_of, search
 from detect.walls import Wall, walls_behind
 from prim.metrics import polygon_areas
@@ -37,7 +37,10 @@ SAME_NOISE = 0.03
 
 @dataclass
 class Candidate:
-    """One thing that is fitted: where it was first seen, the rays around it, and what is known of it by ``now``."""
+    """One thing that is fitted: where it was first seen, the rays around it, and what is known of it by ``now``.
+
+    Its fits are ``rough`` where they were made to some of the rays only.
+    """
 
     start: Primitive
     beams: Beams
@@ -48,6 +51,7 @@ class Candidate:
     fits: list[Fit] = field(default_factory=list)
     fitted_to: tuple[Sensor, Beams] | None = None
     said: tuple[Backdrop, float, FloatArray] | None = None
+    rough: bool = False
     now: Primitive = field(init=False)
 
     def __post_init__(self) -> None:
@@ -77,7 +81,9 @@ class Candidate:
         return Fit(kind, parameters(self.start), 0.0, np.eye(TIES[kind].shape[1]))
 
     def may_be(self, primitive: Primitive) -> bool:
-        """Whether a primitive keeps off the walls behind it."""
+        """Whether a primitive keeps off the walls behind it, and is no larger than primitives are."""
+        if max(parameters(primitive)[3:]) >= longest(primitive.kind):
+            return False
         own = (wall for wall in self.walls if wall.behind is self.start)
         return not self.cells.is_pierced_by(primitive) and not any(wall.is_cut_by(primitive) for wall in own)
 
@@ -100,10 +106,11 @@ def _fit_one(candidate: Candidate, beams: Beams, sensor: Sensor, anew: bool) -> 
     """Leaves a candidate's kinds, likeliest first, as far as a Gaussian tells their evidence."""
     before = candidate.fitted_to
     searched = candidate.known is None and (anew or before is None)
-    if before is not None and not searched and _much_alike(before[0], sensor) and before[1].much_alike(beams):
+    if before is not None and not searched and not candidate.rough and _much_alike(before, sensor, beams):
         return
+    candidate.rough = searched
     if searched:
-        fits = search(candidate.now, beams, sensor)
+        fits = search(candidate.now, candidate.fits, beams, sensor)
     elif candidate.known is not None:
         fits = again([candidate.known_fit], beams, sensor)
     else:
@@ -116,9 +123,11 @@ def _fit_one(candidate: Candidate, beams: Beams, sensor: Sensor, anew: bool) -> 
     candidate.take([fit for fit in ordered if fit.kind in likely], beams, sensor)
 
 
-def _much_alike(one: Sensor, other: Sensor) -> bool:
-    """Whether fits for one sensor need not be made again for another."""
-    return abs(one.std - other.std) < SAME_NOISE * other.std and one.footprint == other.footprint
+def _much_alike(before: tuple[Sensor, Beams], sensor: Sensor, beams: Beams) -> bool:
+    """Whether fits that were made to some beams before need not be made again."""
+    one, fitted_to = before
+    same = abs(one.std - sensor.std) < SAME_NOISE * sensor.std and one.footprint == sensor.footprint
+    return same and fitted_to.much_alike(beams)
 
 
 def look_behind(pool: Executor, candidates: Sequence[Candidate], cells: MapCells, margin: float) -> list[bool]:

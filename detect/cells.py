@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from detect.lines import Line, find_lines
+from detect.lines import Line, find_lines, middle_line, off_line
 from mapping.grid import GridFrame, OccupancyGrid
 from mapping.rays import kernel
 from prim.metrics import BoolGrid, dilate
@@ -23,6 +23,9 @@ LARGE = 0.75
 
 LEAST_WALL = 0.8
 """A straight line through this much (m) of what is occupied and next to something free is a wall."""
+
+BENT = 3.0
+"""Noise bends a wall in the map: its cells lie this near (cells) to its line."""
 
 WALL_CELLS = 3.0
 """Cells this near (cells) to a wall's line are the wall's: noise makes it thick."""
@@ -184,11 +187,10 @@ def _along_lines(grid: OccupancyGrid) -> tuple[BoolGrid, list[OneSided]]:
     free = centres(grid.free & dilate(grid.occupied, round(2 * WALL_CELLS)), grid.frame)
     near = np.zeros(len(points), np.bool_)
     one_sided = []
-    for line in find_lines(surface, resolution, LEAST_WALL, MOST_WALLS):
+    for line, on_it in _straight(surface, resolution):
         nx, ny, d = line
         off, along = points @ np.array([nx, ny]) - d, points @ np.array([-ny, nx])
         thin = WALL_CELLS * resolution
-        on_it = surface[np.abs(surface @ np.array([nx, ny]) - d) < resolution]
         side = _free_side(line, on_it, free, resolution)
         first, last = _ends(on_it, line)
         beside = (along > first - thin) & (along < last + thin)
@@ -199,6 +201,16 @@ def _along_lines(grid: OccupancyGrid) -> tuple[BoolGrid, list[OneSided]]:
     walls = np.zeros_like(grid.occupied)
     walls[rows[near], cols[near]] = True
     return walls, one_sided
+
+
+def _straight(surface: FloatArray, resolution: float) -> Iterator[tuple[Line, FloatArray]]:
+    """The lines of straight walls, each with the cells' centres (N, 2) of a ``surface`` that are on it."""
+    for wide in find_lines(surface, resolution, LEAST_WALL, MOST_WALLS, BENT):
+        line = middle_line(surface[off_line(surface, wide) < BENT * resolution], resolution)
+        on_it = surface[off_line(surface, line) < BENT * resolution]
+        along = np.unique(np.rint(on_it @ np.array([-line[1], line[0]]) / resolution))
+        if len(along) * resolution >= LEAST_WALL:
+            yield line, on_it
 
 
 def _ends(on_it: FloatArray, line: Line) -> tuple[float, float]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 
@@ -229,10 +229,13 @@ class Weighed:
     cost: float
 
 
-def weighed(fits: Sequence[Fit], beams: Beams, sensor: Sensor) -> Weighed | None:
+def weighed(
+    fits: Sequence[Fit], beams: Beams, sensor: Sensor, may_be: Callable[[Primitive], bool] = lambda _: True
+) -> Weighed | None:
     """Fits of several kinds to the same beams, weighed by their evidence; no kind is likelier beforehand.
 
-    None where all of them are larger than a primitive is.
+    Those are left out whose primitive, over all that the rays allow, is none that ``may_be``. None where that leaves
+    nothing, or where all are larger than a primitive is.
     """
     fits = [fit for fit in fits if (fit.p[3:] < longest(fit.kind)).all()]
     if not fits:
@@ -241,6 +244,9 @@ def weighed(fits: Sequence[Fit], beams: Beams, sensor: Sensor) -> Weighed | None
     top = max(rough.values())
     sampled = {fit.kind: sample(fit, beams, sensor) for fit in fits if rough[fit.kind] > top - CONTENDER}
     sampled |= _simpler_ones(fits, sampled, beams, sensor)
+    for kind, made in sampled.items():
+        if not may_be(told(kind, made)[0]):
+            sampled[kind] = replace(made, evidence=-math.inf)
     kind = max(sampled, key=lambda one: sampled[one].evidence)
     best = sampled[kind].evidence
     if best == -math.inf:

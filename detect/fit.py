@@ -50,7 +50,10 @@ ALIKE = 1.3
 """A triangle whose sides are no more unlike than this may have been fitted with the wrong apex."""
 
 SIMPLER = {Kind.RECTANGLE: Kind.SQUARE, Kind.ELLIPSE: Kind.CIRCLE}
-"""Kinds that are special cases of others, and fitted wherever these are."""
+"""Kinds that are special cases of others; each is fitted wherever the other is."""
+
+STRETCHED = 1.03
+"""An ellipse begins with a circle whose one axis is so much longer, the other so much shorter."""
 
 
 @dataclass(frozen=True)
@@ -135,15 +138,16 @@ def starts(of: Primitive, kind: Kind) -> list[FloatArray]:
     return made
 
 
-def search(now: Primitive, beams: Beams, sensor: Sensor) -> list[Fit]:
+def search(now: Primitive, before: Sequence[Fit], beams: Beams, sensor: Sensor) -> list[Fit]:
     """Every kind that may explain what was taken for a primitive, fitted to its beams.
 
-    Starts are fitted to some of the rays, and held against all of them, beside what it was taken for ``now``; from
-    the best of each kind the fit goes on with more rays.
+    Starts are fitted to some of the rays, and held against all of them, beside what it was taken for ``now`` and what
+    fits it had ``before``; from the best of each kind the fit goes on with more rays.
     """
     ways = [(kind, p) for kind in Kind for p in starts(now, kind)]
     coarse = _fit_each(ways, Share.of(beams, COARSE_RAYS), sensor, COARSE)
-    ranked = _ranked([*((fit.kind, fit.p) for fit in coarse), (now.kind, parameters(now))], beams, sensor)
+    made = [(fit.kind, fit.p) for fit in (*coarse, *before)]
+    ranked = _ranked([*made, (now.kind, parameters(now))], beams, sensor)
     best: dict[Kind, float] = {}
     for cost, (kind, _) in ranked:
         best.setdefault(kind, cost)
@@ -171,7 +175,9 @@ def again(fits: Sequence[Fit], beams: Beams, sensor: Sensor) -> list[Fit]:
 
 
 def _finely(ways: Sequence[Way], share: Share, sensor: Sensor, how: Descent) -> list[Fit]:
-    """The best fit of each kind from some ways to it; a triangle's also with the other two corners as its apex."""
+    """The best fit of each kind from some ways to it; a triangle's also with the other two corners as its apex, a
+    rectangle's and an ellipse's also from the square or circle that it is no better than.
+    """
     best: dict[Kind, Fit] = {}
 
     def keep(fits: Sequence[Fit]) -> None:
@@ -183,7 +189,25 @@ def _finely(ways: Sequence[Way], share: Share, sensor: Sensor, how: Descent) -> 
     if Kind.TRIANGLE in best:
         others = [(Kind.TRIANGLE, p) for p in other_apexes(best[Kind.TRIANGLE].p)]
         keep(_fit_each(others, share, sensor, how))
+    stuck = [
+        (kind, p)
+        for kind, simple in SIMPLER.items()
+        if simple in best and (kind not in best or best[kind].cost > best[simple].cost - how.tolerance)
+        for p in unlike(kind, best[simple].p)
+    ]
+    keep(_fit_each(stuck, share, sensor, how))
     return list(best.values())
+
+
+def unlike(kind: Kind, p: FloatArray) -> list[FloatArray]:
+    """Where the fit of a ``kind`` begins whose special case has parameters ``p``: with these for a rectangle, in four
+    directions a little longer for an ellipse, since a circle has none to turn to.
+    """
+    if kind is Kind.RECTANGLE:
+        return [p]
+    longer = np.array([STRETCHED, 1 / STRETCHED])
+    turns = [quarter * math.pi / 4 for quarter in range(4)]
+    return [np.array([p[0], p[1], turn, *(p[3:] * longer)]) for turn in turns]
 
 
 def other_apexes(p: FloatArray) -> list[FloatArray]:

@@ -63,13 +63,13 @@ LEAST_GAIN = 25.0
 MOST_MISFIT = 0.25
 """Of the rays that meet a primitive, the map explains each better by no more than this (nats) on average."""
 
-MOST_SPREAD = 0.2
+MOST_SPREAD = 0.25
 """And its sizes are known to within this share of them (one standard deviation)."""
 
 LEAST_SEEN = 0.35
 """What the networks did not find, or hardly, must be seen in this share of the directions around it."""
 
-LEAST_SURE = 0.5
+LEAST_SURE = 0.33
 """And its kind must be at least as sure as this."""
 
 SURE = 0.95
@@ -312,8 +312,8 @@ def finish(candidate: Candidate, map_alone: Backdrop, sensor: Sensor) -> Refined
     """Weighs a candidate's kinds and gives the likeliest one's parameters, with their uncertainty."""
     assert candidate.fitted_to is not None
     beams = candidate.fitted_to[1]
-    told = weighed(candidate.fits, beams, sensor)
-    if told is None or not candidate.may_be(told.primitive):
+    told = weighed(candidate.fits, beams, sensor, candidate.may_be)
+    if told is None:
         return None
     gain = float(-beams.rays[MISS].sum() - told.cost)
     misfit, rays, seen = _held_against_map(told.primitive, beams, map_alone, sensor)

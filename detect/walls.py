@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from detect.cells import MapCells, circumradius, is_within
-from detect.lines import Line, find_lines
+from detect.lines import Line, find_lines, middle_line, off_line
 from prim.raycast import FloatArray
 from prim.shapes import Kind, Primitive
 
@@ -29,6 +29,9 @@ LEAST_LENGTH = 0.12
 
 OWN = 0.04
 """Cells this near (m) to a candidate say nothing of a wall's line."""
+
+BENT = 2.0
+"""Its cells lie this near (cells) to its line, along which noise has bent it."""
 
 WALL_CELLS = 3.5
 """Cells this near (cells) to the stretch stand for it."""
@@ -64,7 +67,7 @@ def walls_behind(cells: MapCells, candidates: Sequence[Primitive], starts: Seque
 
     A wall is seen from the side on which a candidate was first taken to stand: ``starts``.
     """
-    points = cells.wall_surface
+    points, resolution = cells.wall_surface, cells.frame.resolution
     if not len(points):
         return []
     places = np.array([(one.x, one.y) for one in candidates])
@@ -76,7 +79,8 @@ def walls_behind(cells: MapCells, candidates: Sequence[Primitive], starts: Seque
             continue
         for other in np.flatnonzero(_around(one, places, 2 * reach)).tolist():
             near = near[~is_within(candidates[other], near, OWN)]
-        for nx, ny, d in find_lines(near, cells.frame.resolution, 2 * LEAST_LENGTH, 2):
+        for rough in find_lines(near, resolution, 2 * LEAST_LENGTH, 2, BENT):
+            nx, ny, d = middle_line(near[off_line(near, rough) < BENT * resolution], resolution)
             side = 1.0 if nx * start.x + ny * start.y > d else -1.0
             wall = _stretch(cells, one, start, (side * nx, side * ny, side * d), near)
             if wall is not None:
@@ -95,12 +99,12 @@ def _stretch(cells: MapCells, candidate: Primitive, start: Primitive, line: Line
     gap = float((candidate.outline(32) @ np.array([nx, ny]) - d).min())
     if gap > CLOSE:
         return None
-    on_line = points[np.abs(points @ np.array([nx, ny]) - d) < 1.5 * cells.frame.resolution]
+    resolution = cells.frame.resolution
+    on_line = points[off_line(points, line) < (BENT + 0.5) * resolution]
     along = on_line @ np.array([-ny, nx])
     middle = -ny * candidate.x + nx * candidate.y
     reach = circumradius(candidate)
     left, right = along[along < middle - 0.5 * reach], along[along > middle + 0.5 * reach]
-    resolution = cells.frame.resolution
     if min(len(np.unique(np.rint(part / resolution))) for part in (left, right)) * resolution < LEAST_LENGTH:
         return None
     low, high = max(float(left.min()), middle - reach - 0.15), min(float(right.max()), middle + reach + 0.15)

@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import ndimage
 
-from detect.cells import number_connected
+from detect.cells import MapCells, number_connected
+from detect.lines import middle_line, off_line
+from tests.detect.rooms import mapped, room, scans
 
 
 @given(seed=st.integers(0, 10_000), share=st.floats(0, 0.6), most=st.integers(1, 40))
@@ -21,3 +24,22 @@ def test_what_hangs_together_is_numbered_as_scipy_does(seed: int, share: float, 
     assert (labels == expected).all()
     spans = [max(part.stop - part.start for part in parts) for parts in ndimage.find_objects(expected)]
     assert (large == np.isin(expected, [k for k, span in enumerate(spans, start=1) if span > most])).all()
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_walls_that_noise_bends_are_walls(seed: int) -> None:
+    """Their lines are where the room's are, to within what the map tells; nothing is free behind them."""
+    cells = MapCells.of(mapped(scans(room(), 0.5, seed=seed)))
+    assert len(cells.walls) == 4
+    for wall in cells.walls:
+        nx, ny, d = wall.line
+        assert max(abs(nx), abs(ny)) > 0.998 and d == pytest.approx(-1.0, abs=0.04)
+        assert wall.last - wall.first > 1.5
+
+
+def test_a_sharp_wall_stays_where_it_is_beside_what_stands_on_it() -> None:
+    along = np.arange(0.0, 2.0, 0.01)
+    wall = np.column_stack((along, 0.3 + 0.1 * along))
+    beside = wall[60:110] + np.array([0.0, 0.025])
+    line = middle_line(np.concatenate((wall, beside)), 0.01)
+    assert off_line(wall, line).max() < 0.001
