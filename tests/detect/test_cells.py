@@ -28,13 +28,13 @@ def test_what_hangs_together_is_numbered_as_scipy_does(seed: int, share: float, 
 
 @pytest.mark.parametrize("seed", range(3))
 def test_walls_that_noise_bends_are_walls(seed: int) -> None:
-    """Their lines are where the room's are, to within what the map tells; nothing is free behind them."""
-    cells = MapCells.of(mapped(scans(room(), 0.5, seed=seed)))
+    """From one end to the other, where the room's are, to within what the map tells; nothing is free behind them."""
+    cells = MapCells.of(mapped(scans(room(), 0.5, stops=6, seed=seed)))
     assert len(cells.walls) == 4
     for wall in cells.walls:
         nx, ny, d = wall.line
         assert max(abs(nx), abs(ny)) > 0.998 and d == pytest.approx(-1.0, abs=0.04)
-        assert wall.last - wall.first > 1.5
+        assert wall.last - wall.first > 1.8
 
 
 def test_a_sharp_wall_stays_where_it_is_beside_what_stands_on_it() -> None:
