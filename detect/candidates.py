@@ -14,7 +14,7 @@ from detect.beams import Backdrop, Beams, Obstacles, Sensor, backdrop, before, m
 from detect.cells import MapCells, circumradius
 from detect.detector import Detection
 from detect.evidence import laplace, longest
-from detect.fit import SIMPLER, TIES, Fit, again, primitive_of, search
+from detect.fit import SIMPLER, TIES, Fit, again, again_alone, primitive_of, search
 from detect.walls import Wall, walls_behind
 from prim.metrics import polygon_areas
 from prim.raycast import FloatArray
@@ -112,7 +112,7 @@ def _fit_one(candidate: Candidate, beams: Beams, sensor: Sensor, anew: bool) -> 
     if searched:
         fits = search(candidate.now, candidate.fits, beams, sensor)
     elif candidate.known is not None:
-        fits = again([candidate.known_fit], beams, sensor)
+        fits = again_alone(candidate.known_fit, beams, sensor)
     else:
         fits = again(candidate.fits, beams, sensor)
     possible = [fit for fit in fits if candidate.may_be(primitive_of(fit.kind, fit.p))]

@@ -170,8 +170,13 @@ def _ranked(ways: Sequence[Way], beams: Beams, sensor: Sensor) -> list[tuple[flo
 
 
 def again(fits: Sequence[Fit], beams: Beams, sensor: Sensor) -> list[Fit]:
-    """Kinds fitted again, from where they are."""
+    """Kinds fitted again, from where they are, beside those that they are special cases of."""
     return _finely([(fit.kind, fit.p) for fit in fits], Share(beams), sensor, LAST)
+
+
+def again_alone(fit: Fit, beams: Beams, sensor: Sensor) -> list[Fit]:
+    """One kind fitted again, and no other."""
+    return _fit_each([(fit.kind, fit.p)], Share(beams), sensor, LAST)
 
 
 def _finely(ways: Sequence[Way], share: Share, sensor: Sensor, how: Descent) -> list[Fit]:
