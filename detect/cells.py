@@ -24,8 +24,10 @@ LARGE = 0.75
 LEAST_WALL = 0.8
 """A straight line through this much (m) of what is occupied and next to something free is a wall."""
 
-BENT = 3.0
-"""Noise bends a wall in the map: its cells lie this near (cells) to its line."""
+BENT, LEAST_DENSE = 3.0, 0.7
+"""Noise bends a wall in the map: its cells lie this near (cells) to its line, over such a share of its length at
+least. Lines through specks have half of that.
+"""
 
 WALL_CELLS = 3.0
 """Cells this near (cells) to a wall's line are the wall's: noise makes it thick."""
@@ -208,8 +210,9 @@ def _straight(surface: FloatArray, resolution: float) -> Iterator[tuple[Line, Fl
     for wide in find_lines(surface, resolution, LEAST_WALL, MOST_WALLS, BENT):
         line = middle_line(surface[off_line(surface, wide) < BENT * resolution], resolution)
         on_it = surface[off_line(surface, line) < BENT * resolution]
-        along = np.unique(np.rint(on_it @ np.array([-line[1], line[0]]) / resolution))
-        if len(along) * resolution >= LEAST_WALL:
+        covered = len(np.unique(np.rint(on_it @ np.array([-line[1], line[0]]) / resolution))) * resolution
+        first, last = _ends(on_it, line)
+        if covered >= max(LEAST_WALL, LEAST_DENSE * (last - first)):
             yield line, on_it
 
 

@@ -10,6 +10,7 @@ from scipy import ndimage
 
 from detect.cells import MapCells, number_connected
 from detect.lines import middle_line, off_line
+from mapping.grid import GridFrame, OccupancyGrid
 from tests.detect.rooms import mapped, room, scans
 
 
@@ -43,3 +44,10 @@ def test_a_sharp_wall_stays_where_it_is_beside_what_stands_on_it() -> None:
     beside = wall[60:110] + np.array([0.0, 0.025])
     line = middle_line(np.concatenate((wall, beside)), 0.01)
     assert off_line(wall, line).max() < 0.001
+
+
+def test_specks_are_no_walls() -> None:
+    """However many of them lie along a line by chance."""
+    specks = np.random.default_rng(0).random((220, 220)) < 0.06
+    grid = OccupancyGrid(GridFrame(0.01, -110, -110, 220, 220), np.where(specks, 0.9, 0.1).astype(np.float32))
+    assert not MapCells.of(grid).large.any()

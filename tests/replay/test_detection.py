@@ -81,7 +81,7 @@ def test_what_was_found_is_refined_by_the_rays(noisy_session: Session, knowing: 
     for one in told["primitives"]:
         assert one["stage"] == "refined" and 0 < one["score"] <= 1
         assert set(one["std"]) == {"x", "y", *one["size"], *(["theta"] if one["theta"] is not None else [])}
-        assert all(0 < value < 0.3 for value in one["std"].values())
+        assert all(0 < value < (1.0 if name == "theta" else 0.3) for name, value in one["std"].items())
         assert one["chances"][one["kind"]] == one["score"] == max(one["chances"].values())
     assert told["refine"]["noise_std_m"] == pytest.approx(0.05, rel=0.15)
     assert told["timing"]["refine_s"] > 0
