@@ -127,7 +127,7 @@ def outcome(seed: int, noise_std: float, mapper: str) -> Outcome:
     return Outcome(
         tuple(rows),
         len(primitives),
-        marked(refined.found, session.primitives),
+        marked(refined, session.primitives),
         (sum(pair.found for pair in networks), len(detections.found)),
         (len(peers), len(peer)),
         ended - between,

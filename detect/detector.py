@@ -66,13 +66,17 @@ class Detection:
 
 @dataclass(frozen=True)
 class Rejection:
-    """A candidate that is no detection: kind, score, where its box has its middle (m), and by which threshold."""
+    """A candidate that is no detection: kind, score, where its box has its middle (m), and by which threshold.
+
+    ``fitted``: what the rays make of it, where they make anything of it.
+    """
 
     kind: Kind
     score: float
     x: float
     y: float
     reason: str
+    fitted: Detection | None = None
 
 
 @dataclass(frozen=True)

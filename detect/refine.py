@@ -160,7 +160,7 @@ def refine_detections(
     for number, (guess, made) in enumerate(zip(wanted, refined, strict=True)):
         reason = contradiction(made) if number < len(detections.found) else doubt(made, guess.primitive, cells)
         if made is None or reason:
-            rejected.append(_rejected(guess, reason))
+            rejected.append(_rejected(guess, made, reason))
         else:
             kept.append(_detection(made, guess.crop))
     asked = {id(one) for one in unsure}
@@ -223,8 +223,9 @@ def doubt(made: Refined | None, guess: Primitive, cells: MapCells) -> str:
     return ""
 
 
-def _rejected(guess: Detection, reason: str) -> Rejection:
-    return Rejection(guess.primitive.kind, guess.score, guess.primitive.x, guess.primitive.y, reason)
+def _rejected(guess: Detection, made: Refined | None, reason: str) -> Rejection:
+    fitted = None if made is None else _detection(made, guess.crop)
+    return Rejection(guess.primitive.kind, guess.score, guess.primitive.x, guess.primitive.y, reason, fitted)
 
 
 def _detection(made: Refined, crop: NDArray[np.uint8]) -> Detection:

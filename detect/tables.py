@@ -248,8 +248,9 @@ SHIPPED = """\
 Made by `prim-eval --suite shipped`; seeds and ways of recording stand in `detect/suite.py`: no network was trained or
 chosen on these sessions. F1, mAP 0.5 and mAP 0.5–0.95 are of boxes, as in the paper's tables: first of the networks
 alone (F1: the largest over all confidences), then of what a replay tells, refined by the log's rays. There each
-primitive counts as every kind with the chance of that kind, and F1 is of what is told (kind right, outlines overlap
-by half). Errors are means over what is told and right, of angles the median."""
+primitive counts as every kind with the chance of that kind, what was fitted but is not told with a tenth of it (of
+networks alone, too, mAP counts what scores below the thresholds), and F1 is of what is told (kind right, outlines
+overlap by half). Errors are means over what is told and right, of angles the median."""
 
 SHIPPED_COLUMNS = (
     "networks_f1", "networks_map50", "networks_map50_95", "f1", "map50", "map50_95", "position_mm", "width_mm",

@@ -1,7 +1,8 @@
 """Recorded sessions from one end to the other, as a replay goes: mapped, looked at, refined by the log's rays.
 
-Networks are measured as YOLOv5's own evaluation does: every candidate of every kind counts with its score. What is
-refined is measured alike: every primitive that the rays support counts as each kind with the chance of that kind.
+Networks are measured as YOLOv5's own evaluation does: every candidate of every kind counts with its score, those
+below the thresholds as well. What is refined is measured alike: every primitive that was fitted to rays counts as
+each kind with the chance of that kind, and where it was no detection in the end, with a share of it.
 """
 
 from __future__ import annotations
@@ -16,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from detect.dataset import MARGIN, Sample, SetOptions, held_in, map_scans, recorded, session_options
-from detect.detector import Detection, Detector
+from detect.detector import Detection, Detections, Detector
 from detect.evaluate import Pictured, errors_of, found_rates, mark
 from detect.refine import refine_detections
 from detect.scores import Marked, score_boxes
@@ -30,6 +31,9 @@ from prim.shapes import Primitive
 
 LEAST_CHANCE = 0.001
 """A kind that is less likely than this does not count: as little as candidates that are not looked at."""
+
+RIGHT_AFTER_ALL = 0.1
+"""What was fitted and is no detection in the end counts with this share of its chances: about as often it is there."""
 
 
 @dataclass(frozen=True)
@@ -67,7 +71,7 @@ def trial(seed: int, options: SetOptions, mapper: str, weights: Path) -> tuple[T
     candidates = mark(detector.yolo, pictured)
     return (
         Told.of(candidates, detections.found, world.primitives),
-        Told.of([marked(refined.found, world.primitives)], refined.found, world.primitives),
+        Told.of([marked(refined, world.primitives)], refined.found, world.primitives),
     )
 
 
@@ -98,15 +102,17 @@ def _loaded(weights: Path, mapper: str) -> Detector:
     return Detector.load(weights, mapper, 1)
 
 
-def marked(found: Sequence[Detection], true: Sequence[Primitive]) -> Marked:
+def marked(refined: Detections, true: Sequence[Primitive]) -> Marked:
     """The boxes around outlines, as each kind that they may be of by its chance; beside the true ones, in cells of
     10 mm.
     """
+    unsure = [one.fitted for one in refined.rejected if one.fitted is not None]
     told = [
-        (box_around(one.primitive), KINDS.index(kind), chance)
-        for one in found
+        (box_around(one.primitive), KINDS.index(kind), share * chance)
+        for ones, share in ((refined.found, 1.0), (unsure, RIGHT_AFTER_ALL))
+        for one in ones
         for kind, chance in (one.chances or {one.primitive.kind: one.score}).items()
-        if chance >= LEAST_CHANCE
+        if share * chance >= LEAST_CHANCE
     ]
     boxes = np.array([box for box, _, _ in told], np.float32).reshape(-1, 4)
     kinds = np.array([kind for _, kind, _ in told], np.intp)

@@ -14,10 +14,10 @@ import pytest
 
 from detect import suite, tables
 from detect.dataset import SetOptions, box_of, make, samples
-from detect.detector import Detection, Detector
+from detect.detector import Detection, Detections, Detector, Rejection
 from detect.evaluate import choose_thresholds, evaluate
 from detect.paper import ROWS, SHAPES, TABLE_1, TABLE_2
-from detect.trials import marked, summed_up, trial
+from detect.trials import RIGHT_AFTER_ALL, marked, summed_up, trial
 from detect.weights import ALL_KINDS, Card
 from detect.yolo import KINDS
 from prim.errors import UsageError
@@ -204,11 +204,20 @@ def test_each_kind_counts_by_its_chance() -> None:
     crop = np.zeros((0, 0), np.uint8)
     chances = {Kind.RECTANGLE: 0.7, Kind.SQUARE: 0.2995, Kind.CIRCLE: 0.0005}
     told = Detection(replace(square, kind=Kind.RECTANGLE, size=(0.2, 0.19)), 0.7, (0, 0, 0, 0), crop, None, chances)
-    boxes = marked([told], [square]).boxes
+    boxes = marked(Detections((told,), ()), [square]).boxes
     assert [KINDS[kind] for kind in boxes.kind] == [Kind.RECTANGLE, Kind.SQUARE]
     assert boxes.score == pytest.approx([0.7, 0.2995]) and boxes.box[0] == pytest.approx([-10, -9.5, 10, 9.5])
-    alone = marked([replace(told, chances=None)], [square]).boxes
+    alone = marked(Detections((replace(told, chances=None),), ()), [square]).boxes
     assert alone.score == pytest.approx([0.7]) and len(alone) == 1
+
+
+def test_what_is_no_detection_counts_with_a_share_of_its_chance() -> None:
+    """As candidates below a network's thresholds count: less than what is told, but they count."""
+    square = Primitive(Kind.SQUARE, 0.0, 0.0, 0.0, (0.2,))
+    fitted = Detection(square, 0.9, (0, 0, 0, 0), np.zeros((0, 0), np.uint8), None, {Kind.SQUARE: 0.9})
+    unsure = Rejection(Kind.SQUARE, 0.1, 0.0, 0.0, "its sizes are not known", fitted)
+    boxes = marked(Detections((), (unsure, replace(unsure, fitted=None))), [square]).boxes
+    assert boxes.score == pytest.approx([0.9 * RIGHT_AFTER_ALL]) and len(boxes) == 1
 
 
 def test_shipped_weights_that_are_not_there(tmp_path: Path) -> None:
