@@ -59,6 +59,7 @@ class PresetName(StrEnum):
 
     PRIM = "prim"
     PAPER = "paper"
+    MORE = "more"
 
 
 class YoloPresetName(StrEnum):
@@ -157,7 +158,9 @@ def cnn(
     output: Annotated[Path, typer.Argument(metavar="FOLDER", help="Where checkpoints go: cnn.MAPPER[.KIND].pt.")],
     mapper: Annotated[MapperName, typer.Option(help="Whose maps to learn from.")] = MapperName.FORWARD,
     kind: Annotated[KindName, typer.Option(help="The kind, or kinds, to read.")] = KindName.ALL,
-    preset: Annotated[PresetName, typer.Option(help="Ours, or the paper's settings.")] = PresetName.PRIM,
+    preset: Annotated[
+        PresetName, typer.Option(help="Ours, the paper's settings, or more of ours.")
+    ] = PresetName.PRIM,
     epochs: Annotated[
         int | None, typer.Option(metavar="N", help="Passes over the set. [default: the preset's]")
     ] = None,

@@ -11,7 +11,6 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
-from shutil import copyfile
 from typing import Any
 
 from detect.dataset import PRESETS, SetOptions, make, samples, style_of
@@ -22,7 +21,7 @@ from detect.yolo import Yolo
 from prim.shapes import Kind
 
 MIXED, LARGE = PRESETS["mixed"], PRESETS["large"]
-"""What shipped weights are trained on; and the first mapper's go on with."""
+"""What the first mapper's networks are trained on; and what each mapper's go on with from there."""
 
 WORTH_SAYING = 5.0
 """What takes no longer than this (s) was there already."""
@@ -72,8 +71,7 @@ def make_weights(
 ) -> Path:
     """Trains all networks on a set, with thresholds from its validation split; what is there is not made again.
 
-    ``start`` is what YOLO begins from, ``cnn_start`` the checkpoint that our one CNN begins from, or None. A preset
-    that is YOLO's alone leaves the CNN as it is.
+    ``start`` is what YOLO begins from, ``cnn_start`` the checkpoint that our one CNN begins from, or None.
     """
     if (folder / DETECTOR).exists():
         return folder
@@ -88,12 +86,9 @@ def make_weights(
     for kinds in networks_of(preset, list(Kind)):
         name = "cnn" if len(kinds) == len(Kind) else f"cnn.{'-'.join(kinds)}"
         checkpoint = folder / checkpoint_name(mapper, kinds)
-        if preset in CNN_PRESETS:
-            with timed(f"{folder.name}: {name}", say):
-                train_cnn(data, mapper, kinds, checkpoint, replace(CNN_PRESETS[preset], start=cnn_start))
-            export_cnn(checkpoint, mapper, folder / f"{name}.onnx", about)
-        elif cnn_start is not None:
-            copyfile(cnn_start.with_name(f"{name}.onnx"), folder / f"{name}.onnx")
+        with timed(f"{folder.name}: {name}", say):
+            train_cnn(data, mapper, kinds, checkpoint, replace(CNN_PRESETS[preset], start=cnn_start))
+        export_cnn(checkpoint, mapper, folder / f"{name}.onnx", about)
     part = folder / "yolo.part"
     export_yolo(best, mapper, part, True, style, about)
     put_thresholds(part, data)
@@ -113,19 +108,14 @@ def put_thresholds(yolo: Path, data: Path) -> None:
 def make_all(work: Path, mappers: Sequence[str], say: Say) -> Iterator[Path]:
     """The weights that come with prim, each mapper's in a folder of its own.
 
-    The first mapper's networks, FIRST's, begin from drawings, and go on with more sessions; the others' begin from
-    the first mapper's, since all maps look alike.
+    FIRST's networks begin from drawings; each mapper's go on from these with more sessions, as all maps look alike.
     """
-    start, data = make_start(work, say), make_set(work / "mixed", MIXED, say)
-    first = make_weights(data, FIRST, work / "first", "prim", start, say, origin(MIXED))
+    start, mixed = make_start(work, say), make_set(work / "mixed", MIXED, say)
+    first = make_weights(mixed, FIRST, work / "first", "prim", start, say, origin(MIXED))
     yolo, cnn = first / "yolo" / "weights" / "best.pt", first / f"cnn.{FIRST}.pt"
+    large = make_set(work / "large", LARGE, say)
     for mapper in mappers:
-        folder = work / "weights" / mapper
-        if mapper == FIRST:
-            more = make_set(work / "large", LARGE, say)
-            yield make_weights(more, mapper, folder, "more", yolo, say, origin(LARGE), cnn)
-        else:
-            yield make_weights(data, mapper, folder, "transfer", yolo, say, origin(MIXED), cnn)
+        yield make_weights(large, mapper, work / "weights" / mapper, "more", yolo, say, origin(LARGE), cnn)
 
 
 def origin(options: SetOptions) -> dict[str, Any]:

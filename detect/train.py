@@ -59,10 +59,10 @@ class CnnOptions:
 
 CNN_PRESETS = {
     PRIM.name: CnnOptions(),
-    "transfer": CnnOptions(epochs=10, learning_rate=0.0005),
+    "more": CnnOptions(epochs=10, learning_rate=0.0005),
     PAPER.name: CnnOptions(PAPER.name, epochs=20, vary=False),
 }
-"""Ours, from nothing and from another mapper's network; and the paper's (IV-B: 20 epochs, batch 128, Adam, learning
+"""Ours, from nothing and on from there with more sessions; the paper's (IV-B: 20 epochs, batch 128, Adam, learning
 rate 0.001, the crops as they are)."""
 
 
@@ -251,13 +251,12 @@ class YoloOptions:
 
 YOLO_PRESETS = {
     "prim": YoloOptions(),
-    "more": YoloOptions(epochs=5, learning_rate=0.001),
-    "transfer": YoloOptions(epochs=8, learning_rate=0.001),
+    "more": YoloOptions(epochs=24, learning_rate=0.001),
     "paper": YoloOptions(epochs=32, image_size=224, optimizer="SGD", learning_rate=0.01, turn=False),
     "drawings": YoloOptions(epochs=3, mosaic=False, turn=False),
 }
-"""Ours, from drawings, on from there with more sessions, and from another mapper's network; the paper's (IV-B: 32
-epochs, batch 32, SGD, learning rate 0.01); and one for detect.drawings, which vary by themselves."""
+"""Ours, from drawings and on from there with more sessions; the paper's (IV-B: 32 epochs, batch 32, SGD, learning
+rate 0.01); and one for detect.drawings, which vary by themselves."""
 
 
 def train_yolo(data: Path, mapper: str, output: Path, options: YoloOptions) -> Path:
@@ -328,7 +327,9 @@ def _fit_yolo(model: Any, config: Path, output: Path, options: YoloOptions) -> N
     turns = {"degrees": 180.0, "flipud": 0.5} if options.turn else {}
     model.train(
         trainer=_trainer(),
-        workers=2,
+        workers=max(2, len(os.sched_getaffinity(0)) - 1),
+        cache="ram",
+        amp=False,  # on a GPU, ultralytics tries it out on weights that it downloads
         data=str(config),
         epochs=options.epochs,
         batch=options.batch,
