@@ -33,7 +33,7 @@ LEAST_CHANCE = 0.001
 """A kind that is less likely than this does not count: as little as candidates that are not looked at."""
 
 RIGHT_AFTER_ALL = 0.1
-"""What was fitted and is no detection in the end counts with this share of its chances: about as often it is there."""
+"""What was fitted and is no detection in the end counts with this share of its chances: seldom is it there."""
 
 
 @dataclass(frozen=True)
