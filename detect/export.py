@@ -62,7 +62,7 @@ def export_cnn(checkpoint: Path, mapper: str, output: Path, about: Mapping[str, 
 
 def _read_checkpoint(path: Path) -> tuple[ParameterNetwork, dict[str, Any]]:
     try:
-        state: dict[str, Any] = torch.load(path, weights_only=True)
+        state: dict[str, Any] = torch.load(path, weights_only=True, map_location="cpu")
         options = state["options"]
         kinds = [Kind(kind) for kind in state["kinds"]]
         network = ParameterNetwork(kinds, PRESETS[options["preset"]], options["channels"])

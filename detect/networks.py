@@ -57,6 +57,11 @@ class ParameterNetwork(nn.Module):
         outputs = sum(preset.outputs(kind) for kind in self.kinds)
         self.head = nn.Sequential(*layers, nn.Linear(width, outputs))
 
+    @property
+    def device(self) -> torch.device:
+        """Where its weights are."""
+        return next(self.parameters()).device
+
     def forward(self, crops: torch.Tensor) -> torch.Tensor:
         """The outputs."""
         return self.head(self.features(crops))

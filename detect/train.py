@@ -98,7 +98,10 @@ def train_cnn(
         reopen_cnn(options.start, network, as_input(few, network.channels))
     elif options.start is not None:
         network.load_state_dict(_weights_of(options.start, network))
-    network.to(memory_format=torch.channels_last)  # what convolutions on a CPU are three times faster with
+    network.to(
+        "cuda" if torch.cuda.is_available() else "cpu",
+        memory_format=torch.channels_last,  # what convolutions on a CPU are three times faster with
+    )
     optimizer = torch.optim.Adam(network.parameters(), lr=options.learning_rate)
     schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, options.epochs)
     asked = {
@@ -117,14 +120,13 @@ def train_cnn(
         _keep(output, asked, network, optimizer, schedule, epoch + 1)
         if progress:
             progress(epoch + 1, options.epochs, loss, evaluate_cnn(network, validation))
-    network.eval()
-    return network
+    return network.eval().cpu()
 
 
 def _weights_of(checkpoint: Path, network: ParameterNetwork) -> Any:
     """Another network's weights. Raises UsageError where it is not of the same make; nothing in the file is run."""
     try:
-        state = torch.load(checkpoint, weights_only=True)
+        state = torch.load(checkpoint, weights_only=True, map_location="cpu")
         same = state["kinds"] == [kind.value for kind in network.kinds]
         if same and state["options"]["preset"] == network.preset.name:
             return state["network"]
@@ -150,7 +152,7 @@ def _epoch(
             continue
         pairs = [crops.varied(i, preset, rng) if options.vary else crops.exact(i, preset) for i in chosen.tolist()]
         with fast_arithmetic():
-            outputs = network(as_input(pairs, network.channels))
+            outputs = network(as_input(pairs, network.channels).to(network.device))
         loss = _loss(network, outputs.float(), [primitive for _, primitive in pairs])
         optimizer.zero_grad()
         loss.backward()
@@ -166,7 +168,7 @@ def evaluate_cnn(network: ParameterNetwork, crops: Crops, batch: int = 256) -> f
     with torch.no_grad():
         for begin in range(0, len(crops), batch):
             pairs = [crops.exact(i, network.preset) for i in range(begin, min(begin + batch, len(crops)))]
-            outputs = network(as_input(pairs, network.channels))
+            outputs = network(as_input(pairs, network.channels).to(network.device))
             total += float(_loss(network, outputs, [primitive for _, primitive in pairs])) * len(pairs)
     return total / max(len(crops), 1)
 
@@ -186,12 +188,12 @@ def _loss(network: ParameterNetwork, outputs: torch.Tensor, primitives: Sequence
         weight[row, span] = 1.0 / preset.outputs(primitive.kind)
         if preset.vector:
             weight[row, span.start + preset.lengths(primitive.kind) : span.stop] *= LENGTH_WEIGHT
-    goal = torch.from_numpy(wanted)
+    goal = torch.from_numpy(wanted).to(outputs.device)
     if preset.vector:
         errors = torch.nn.functional.huber_loss(outputs, goal, reduction="none", delta=HUBER)
     else:
         errors = torch.nn.functional.mse_loss(outputs, goal, reduction="none")
-    return (errors * torch.from_numpy(weight)).sum() / len(primitives)
+    return (errors * torch.from_numpy(weight).to(outputs.device)).sum() / len(primitives)
 
 
 def as_input(pairs: Sequence[tuple[Any, Any]], channels: int) -> torch.Tensor:
@@ -217,7 +219,7 @@ def _resume(output: Path, asked: dict[str, Any], network: Any, optimizer: Any, s
     """Takes over a checkpoint where there is one; returns how many epochs it has seen."""
     if not output.exists():
         return 0
-    state = torch.load(output, weights_only=True)
+    state = torch.load(output, weights_only=True, map_location="cpu")
     if {name: state.get(name) for name in asked} != asked:
         raise UsageError(f"{output} was trained on another set or with other options: give another file")
     network.load_state_dict(state["network"])
