@@ -29,6 +29,9 @@ BENT, LEAST_DENSE = 3.0, 0.7
 least. Lines through specks have half of that.
 """
 
+SHARP, LEAST_SHARP = 1.0, 0.4
+"""Or they lie this near, over such a share: mappers wear holes into walls that are seen at a slant."""
+
 WALL_CELLS = 3.0
 """Cells this near (cells) to a wall's line are the wall's: noise makes it thick."""
 
@@ -209,11 +212,17 @@ def _straight(surface: FloatArray, resolution: float) -> Iterator[tuple[Line, Fl
     """The lines of straight walls, each with the cells' centres (N, 2) of a ``surface`` that are on it."""
     for wide in find_lines(surface, resolution, LEAST_WALL, MOST_WALLS, BENT):
         line = middle_line(surface[off_line(surface, wide) < BENT * resolution], resolution)
-        on_it = surface[off_line(surface, line) < BENT * resolution]
-        covered = len(np.unique(np.rint(on_it @ np.array([-line[1], line[0]]) / resolution))) * resolution
+        off = off_line(surface, line) / resolution
+        on_it = surface[off < BENT]
         first, last = _ends(on_it, line)
-        if covered >= max(LEAST_WALL, LEAST_DENSE * (last - first)):
+        dense, sharp = (_covered(surface[off < width], line, resolution) for width in (BENT, SHARP))
+        if dense >= LEAST_WALL and max(dense / LEAST_DENSE, sharp / LEAST_SHARP) >= last - first:
             yield line, on_it
+
+
+def _covered(on_it: FloatArray, line: Line, resolution: float) -> float:
+    """How much (m) of a line has cells on it."""
+    return len(np.unique(np.floor(on_it @ np.array([-line[1], line[0]]) / resolution))) * resolution
 
 
 def _ends(on_it: FloatArray, line: Line) -> tuple[float, float]:

@@ -51,3 +51,18 @@ def test_specks_are_no_walls() -> None:
     specks = np.random.default_rng(0).random((220, 220)) < 0.06
     grid = OccupancyGrid(GridFrame(0.01, -110, -110, 220, 220), np.where(specks, 0.9, 0.1).astype(np.float32))
     assert not MapCells.of(grid).large.any()
+
+
+@pytest.mark.parametrize("upright", [False, True])
+@pytest.mark.parametrize(("length", "kept", "gap"), [(200, 0.55, 1), (120, 1.0, 40)], ids=["worn", "in pieces"])
+def test_walls_have_holes(length: int, kept: float, gap: int, upright: bool) -> None:
+    """A sharp wall, of whose cells no more than 0.4 m hang together: what is left of it is a wall."""
+    wall = np.zeros((220, 220), np.bool_)
+    wall[10, 10 : 10 + length] = np.random.default_rng(1).random(length) < kept
+    wall[10, ::gap] &= gap == 1
+    cells = np.where(wall, 0.9, 0.1).astype(np.float32)
+    cells[:10] = 0.5
+    if upright:
+        cells, wall = cells.T.copy(), wall.T
+    found = MapCells.of(OccupancyGrid(GridFrame(0.01, -110, -110, 220, 220), cells))
+    assert (found.large == wall).all() and len(found.walls) == 1
