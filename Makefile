@@ -7,7 +7,7 @@ NOISE_STD ?= 0.05
 
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
 
-.PHONY: demo test test-slow bench bench-maps bench-forward bench-refine bench-poses lint format clean
+.PHONY: demo test test-slow package bench bench-maps bench-forward bench-refine bench-poses lint format clean
 
 demo: .venv/installed
 	@mkdir -p demo
@@ -25,6 +25,9 @@ test: lint
 
 test-slow: .venv/installed-dev
 	$(BIN)/python -m pytest -q -m slow
+
+package: .venv/installed-dev
+	.ci/package
 
 bench: .venv/installed
 	$(BIN)/python -m bench.speed --update docs/speed.md

@@ -1,6 +1,6 @@
 """How the forward map's probabilities of occupancy are calibrated, and how well they hold.
 
-    python -m bench.calibrate fit          # the coefficients of mapping/calibration.py, from recorded sessions
+    python -m bench.calibrate fit          # the coefficients of mapping.forward.calibration, from recorded ones
     python -m bench.calibrate check        # the reliability curve on other sessions; --update docs/forward.md
 
 Training seeds begin at 10000, those of the check at 20000; no other benchmark uses them.
@@ -21,8 +21,8 @@ from numpy.typing import NDArray
 
 from bench.maps import NOISE_LEVELS, update
 from bench.sessions import recorded
-from mapping.calibration import CLIP, behind_surface, known
-from mapping.forward import ForwardMapper
+from mapping.forward.calibration import CLIP, behind_surface, known
+from mapping.forward.mapper import ForwardMapper
 from recorder.sensors import Lidar
 from recorder.session import SessionOptions
 

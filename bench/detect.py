@@ -19,7 +19,7 @@ from typing import Any
 from bench import classical
 from bench.maps import session_of, update
 from detect.detector import Detector
-from detect.tiles import cut, tiles
+from detect.networks.tiles import cut, tiles
 from mapping.grid import OccupancyGrid
 from mapping.mapper import make_mapper
 from prim.metrics import match_primitives

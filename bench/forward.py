@@ -16,10 +16,11 @@ from pathlib import Path
 
 from bench.maps import session_of, update
 from bench.sessions import Session, posed_scans
-from mapping.forward import ForwardMapper
+from mapping.forward.mapper import ForwardMapper
 from mapping.grid import GridFrame
-from prim.frames import Pose2D, Scan
-from prim.log import LogReader
+from prim.log.mcap import LogReader
+from prim.scan import Scan
+from prim.se2 import Pose2D
 
 BOUNDS = (-1.0, -1.0, 1.0, 1.0)
 SPEED_NOISE = (0.0, 0.02, 0.05, 0.25, 0.5)

@@ -20,13 +20,14 @@ from numpy.typing import NDArray
 
 from bench.maps import session_of, update
 from bench.sessions import Session, posed_scans
-from mapping.forward import ForwardMapper
+from mapping.forward.level import Level, Noise, Rays
+from mapping.forward.mapper import ForwardMapper
 from mapping.grid import GridFrame
-from mapping.level import Level, Noise, Rays
+from mapping.kernels import end_extent
 from mapping.mapper import make_mapper
-from mapping.rays import end_extent
-from prim.frames import Pose2D, Scan
-from prim.log import LogReader
+from prim.log.mcap import LogReader
+from prim.scan import Scan
+from prim.se2 import Pose2D
 
 EVERY = 5
 CLIPS = (1e-5, 1e-4, 1e-3, 1e-2)

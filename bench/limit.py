@@ -23,11 +23,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from detect.beams import FAMILY, Beams, gather, parameters
-from detect.fit import TIES
-from detect.raycost import trace
-from prim.frames import Pose2D, Scan
-from prim.raycast import FloatArray, cast_segments
+from detect.refinement.fit import TIES
+from detect.refinement.kernels import trace
+from detect.refinement.rays import FAMILY, Beams, gather, parameters
+from prim.arrays import FloatArray
+from prim.raycast import cast_segments
+from prim.scan import Scan
+from prim.se2 import Pose2D
 from prim.shapes import Primitive
 
 STEPS = (2e-5, 5e-5, 1e-4, 2e-4, 5e-4, 1e-3, 2e-3, 5e-3, 1e-2)
@@ -43,7 +45,7 @@ JITTER, PLACES = 0.001, 8
 
 @dataclass(frozen=True)
 class Limits:
-    """Both bounds (K,) of one primitive's own parameters (m, rad, in the order of detect.fit.NAMES)."""
+    """Both bounds (K,) of one primitive's own parameters (m, rad, in the order of detect.refinement.fit.NAMES)."""
 
     chapman_robbins: FloatArray
     weiss_weinstein: FloatArray
@@ -95,7 +97,7 @@ class Scene:
 
     @property
     def tie(self) -> FloatArray:
-        """(5, K): see detect.fit.TIES."""
+        """(5, K): see detect.refinement.fit.TIES."""
         return TIES[self.primitive.kind]
 
     def ranges(self, at: FloatArray) -> FloatArray:

@@ -19,8 +19,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bench.sessions import Session, recorded
+from mapping.map_metrics import MapScores, map_scores
 from mapping.mapper import Mapper, make_mapper
-from prim.metrics import MapScores, map_scores
 from recorder.sensors import Lidar
 from recorder.session import SessionOptions
 

@@ -12,9 +12,9 @@ import numpy as np
 
 from bench.heldout import Posed, frame_of
 from bench.sessions import posed_scans
-from mapping.forward import ForwardMapper
+from mapping.forward.mapper import ForwardMapper
 from mapping.grid import GridFrame, OccupancyGrid
-from prim.log import LogReader
+from prim.log.mcap import LogReader
 
 
 def finished(scans: Posed, frame: GridFrame) -> OccupancyGrid:

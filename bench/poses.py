@@ -24,19 +24,22 @@ import numpy as np
 
 from bench.heldout import EVERY, frame_of, rays_of, score
 from bench.maps import update
-from mapping.forward import ForwardMapper
+from mapping.forward.mapper import ForwardMapper
+from prim.arrays import FloatArray, Stamps
 from prim.errors import LogReadError
-from prim.frames import Pose2D, Stamps, wrap_angles
-from prim.log import LogReader
+from prim.log.mcap import LogReader
 from prim.metrics import pose_nees, pose_rmse
-from prim.raycast import FloatArray
+from prim.se2 import Pose2D, wrap_angles
 from recorder.sensors import Lidar
 from recorder.session import SessionOptions, record
-from replay.fusion import Fusion, Nodes, PoseNoise
-from replay.localize import FUSED, SENSORS, FuseOptions, LaserPoses, Localizer
-from replay.matching import match
-from replay.pipeline import Pipeline, ReplayOptions, ReplayResult
-from replay.scans import ScanLog, Selection
+from replay.options import ReplayOptions
+from replay.pipeline import Pipeline
+from replay.posed_scans import ScanLog
+from replay.poses.fusion import Fusion, Nodes, PoseNoise
+from replay.poses.localize import FUSED, SENSORS, FuseOptions, LaserPoses, Localizer
+from replay.poses.scan_matching import match
+from replay.result import ReplayResult
+from replay.selection import Selection
 
 SUBSETS = {
     "odometry, GPS, compass": SENSORS,

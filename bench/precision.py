@@ -20,11 +20,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bench.detect import timed
-from detect.dataset import Sample, read_image, samples
-from detect.evaluate import BATCH, Pictured, mark
-from detect.scores import score_boxes
-from detect.weights import DETECTOR, Weights, load_weights
-from detect.yolo import Yolo
+from detect.evaluation.box_metrics import score_boxes
+from detect.evaluation.evaluate import BATCH, Pictured, mark
+from detect.networks.weights import DETECTOR, Weights, load_weights
+from detect.networks.yolo import Yolo
+from detect.training.dataset import Sample, read_image, samples
 
 CALIBRATION = 100
 """Images that int8's ranges are found from."""

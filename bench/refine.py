@@ -27,19 +27,19 @@ from bench import classical
 from bench.limit import bounds, ratio
 from bench.maps import update
 from bench.sessions import Session, recorded
-from detect.cells import is_within
 from detect.detector import Detector
-from detect.fit import NAMES
-from detect.refine import refine_detections
-from detect.scores import Marked, score_boxes
-from detect.trials import marked
+from detect.evaluation.box_metrics import Marked, score_boxes
+from detect.evaluation.sessions import marked
+from detect.networks.weights import SHIPPED
+from detect.refinement.fit import NAMES
+from detect.refinement.map_cells import is_within
+from detect.refinement.refine import refine_detections
 from mapping.mapper import make_mapper
+from prim.arrays import FloatArray
 from prim.metrics import match_primitives
-from prim.raycast import FloatArray
 from prim.shapes import Kind, Primitive, angle_difference, angle_error
 from recorder.sensors import Lidar
 from recorder.session import SessionOptions
-from replay.lookout import SHIPPED
 
 FIRST_SEED = 40_000
 ARENA = np.array([(-1, -1, 1, -1), (1, -1, 1, 1), (1, 1, -1, 1), (-1, 1, -1, -1)], float)

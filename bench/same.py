@@ -3,8 +3,8 @@
     python -m bench.same keep OUT.json [--checkout DIR] [--sessions 20] [--data FOLDER] [--quick]
     python -m bench.same compare BEFORE.json AFTER.json
 
-``keep`` runs a checkout's command lines (``prim-record``, ``prim-replay``): sessions of all noise levels, each through
-the three mappers, with refinement and without; the logs pillars4.mcap and csail.mcap where they are at hand; and a
+``keep`` runs a checkout's ``prim-record`` and ``prim-replay``: sessions of all noise levels, each through the three
+mappers, with refinement and without; the logs pillars4.mcap and csail.mcap where they are at hand; and a
 driven session with ``--match-scans``. It keeps what was recorded (as a hash) and the reports, but for timings and
 paths. ``compare`` says which differ, and by how much at most; it exits with 1 where anything but a number's last
 digits differs (beyond TOLERANCE).

@@ -7,15 +7,17 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from mapping.grid import GridFrame
-from mapping.truth import TruthMap
-from prim.frames import Pose2D, Scan
-from prim.log import LogReader
+from mapping.reference_map import TruthMap
+from prim.log.mcap import LogReader
+from prim.scan import Scan
+from prim.se2 import Pose2D
 from prim.shapes import Primitive
 from recorder.session import SessionOptions, record
-from replay.localize import Localizer
+from replay.ground_truth import Truth
 from replay.pipeline import WORLD_MARGIN
-from replay.scans import ScanLog, Selection
-from replay.truth import Truth
+from replay.posed_scans import ScanLog
+from replay.poses.localize import Localizer
+from replay.selection import Selection
 
 
 @dataclass(frozen=True)

@@ -27,9 +27,8 @@ import numpy as np
 
 from bench.maps import update
 from mapping.mapper import make_mapper
-from prim.frames import Pose2D, Scan
-from prim.log import LogReader, LogWriter
-from prim.messages import (
+from prim.log.mcap import LogReader
+from prim.log.messages import (
     ODOM_TOPIC,
     ODOMETRY_TYPE,
     SCAN_TOPIC,
@@ -38,6 +37,9 @@ from prim.messages import (
     encode_odometry,
     encode_scan,
 )
+from prim.log.writer import LogWriter
+from prim.scan import Scan
+from prim.se2 import Pose2D
 from recorder.session import SessionOptions, record
 
 BIN = Path(sys.executable).parent

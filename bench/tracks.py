@@ -22,9 +22,10 @@ from bench.maps import update
 from prim.metrics import match_primitives
 from recorder.sensors import Lidar
 from recorder.session import SessionOptions, record
-from replay.lookout import Sighting
-from replay.pipeline import Pipeline, ReplayOptions
-from replay.show import NullViewer
+from replay.detection import Sighting
+from replay.options import ReplayOptions
+from replay.pipeline import Pipeline
+from replay.viewer_protocol import NullViewer
 
 FIRST_SEED = 70_000
 

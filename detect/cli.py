@@ -111,7 +111,7 @@ def dataset(
 
     A set that was interrupted goes on where it stopped; the same options make the same set.
     """
-    from detect.dataset import PRESETS, make
+    from detect.training.dataset import PRESETS, make
 
     given: dict[str, Any] = {
         "sizes": maps,
@@ -143,7 +143,7 @@ def drawings(
     debug: Annotated[bool, typer.Option("--debug", help="Show tracebacks.")] = False,
 ) -> int:
     """Draw primitives to begin training from, where no pretrained weights are at hand: maps of no world."""
-    from detect.drawings import DrawingOptions, make_drawings
+    from detect.training.drawings import DrawingOptions, make_drawings
 
     with console.progress_bar("drawings", quiet) as progress:
         made = make_drawings(folder, DrawingOptions(images, seed), progress)
@@ -176,7 +176,7 @@ def cnn(
     Ours is one network for all kinds; the paper's are one for each.
     """
     need_extra()
-    from detect.train import CNN_PRESETS, checkpoint_name, networks_of, train_cnn
+    from detect.training.train import CNN_PRESETS, checkpoint_name, networks_of, train_cnn
     from prim.shapes import Kind
 
     options = dataclasses.replace(CNN_PRESETS[preset.value], seed=seed, start=start)
@@ -215,7 +215,7 @@ def yolo(
 ) -> int:
     """Train YOLOv5 to find the primitives. An interrupted run goes on."""
     need_extra()
-    from detect.train import YOLO_PRESETS, train_yolo
+    from detect.training.train import YOLO_PRESETS, train_yolo
 
     options = dataclasses.replace(YOLO_PRESETS[preset.value], seed=seed, start=start, trust=trust)
     if epochs is not None:
@@ -247,9 +247,9 @@ def export(
 ) -> int:
     """Make an ONNX file with a model card of trained weights."""
     need_extra()
-    from detect.dataset import style_of
-    from detect.export import export_cnn, export_yolo
-    from detect.recipe import put_thresholds
+    from detect.training.dataset import style_of
+    from detect.training.export import export_cnn, export_yolo
+    from detect.training.recipe import put_thresholds
 
     if stage is StageName.CNN:
         export_cnn(weights, mapper.value, output)
@@ -273,7 +273,7 @@ def every(
     Takes hours, and says how long each part took; an interrupted run goes on.
     """
     need_extra()
-    from detect.recipe import make_all
+    from detect.training.recipe import make_all
 
     for made in make_all(work, [name.value for name in mapper or list(MapperName)], typer.echo):
         typer.echo(f"made: {made}")
@@ -345,14 +345,14 @@ def _evaluate(
         for name in (name for name, value in given.items() if value is not None):
             raise UsageError(f"{name} goes with --suite shipped")
         need_extra()
-        from detect.suite import Suite
-        from detect.tables import report
+        from detect.evaluation.suites import Suite
+        from detect.evaluation.tables import report
 
         made = Suite(work, say)
         written = report(made.measured() if so_far else made.run(), folder)
     else:
-        from detect.suite import ShippedSuite
-        from detect.tables import report_shipped
+        from detect.evaluation.suites import ShippedSuite
+        from detect.evaluation.tables import report_shipped
 
         shipped = ShippedSuite(work, weights or Path(__file__).parent / "shipped", say)
         mappers, ways = ([one.value for one in chosen] for chosen in (mapper or MapperName, recorded or WayName))

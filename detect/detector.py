@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
@@ -12,14 +12,15 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from detect.estimator import Estimator, Found
-from detect.tiles import TILE, cut, tiles, window
-from detect.weights import Weights, load_set
-from detect.yolo import KINDS, Boxes, Yolo, overlap, suppress
+from detect.detection import Detection, Detections, Rejection
+from detect.networks.cnn import Estimator, Found
+from detect.networks.tiles import TILE, cut, tiles, window
+from detect.networks.weights import Weights, load_set
+from detect.networks.yolo import KINDS, Boxes, Yolo, overlap, suppress
 from mapping.grid import GridFrame, OccupancyGrid
 from prim.errors import UsageError
 from prim.metrics import polygon_areas
-from prim.shapes import Kind, Primitive
+from prim.shapes import Primitive
 
 DOUBTFUL = 0.08
 """What scores less than its kind's threshold, but this much at least, is left to the rays to judge."""
@@ -44,51 +45,6 @@ EDGE = 2
 
 BATCH = 8
 """Tiles that go through the network at once: what bounds memory."""
-
-
-@dataclass(frozen=True)
-class Detection:
-    """A primitive with its ``score`` (0 to 1), YOLO's ``box`` (m: x0, y0, x1, y1), and the ``crop`` (pixels, pixels)
-    that its parameters were read from.
-
-    Where it was refined by rays (detect.refine), ``std`` (m, rad) tells by name how sure its parameters are, and
-    ``chances`` of what kind it is: the score is then its kind's, the box its outline's, and the crop is empty where
-    the networks had not found it.
-    """
-
-    primitive: Primitive
-    score: float
-    box: tuple[float, float, float, float]
-    crop: NDArray[np.uint8]
-    std: Mapping[str, float] | None = None
-    chances: Mapping[Kind, float] | None = None
-
-
-@dataclass(frozen=True)
-class Rejection:
-    """A candidate that is no detection: kind, score, where its box has its middle (m), and by which threshold.
-
-    ``fitted``: what the rays make of it, where they make anything of it.
-    """
-
-    kind: Kind
-    score: float
-    x: float
-    y: float
-    reason: str
-    fitted: Detection | None = None
-
-
-@dataclass(frozen=True)
-class Detections:
-    """What was found in a map, best first, and what was not taken for a primitive.
-
-    ``doubtful``: of what was rejected, what scored too little and nothing else: the rays may speak for it.
-    """
-
-    found: tuple[Detection, ...]
-    rejected: tuple[Rejection, ...]
-    doubtful: tuple[tuple[Detection, Rejection], ...] = ()
 
 
 @dataclass(frozen=True)

@@ -14,7 +14,8 @@ import numpy as np
 from PIL import Image, ImageDraw
 
 from bench.maps import session_of
-from detect.detector import Detection, Detector
+from detect.detection import Detection
+from detect.detector import Detector
 from mapping.grid import OccupancyGrid
 from mapping.mapper import make_mapper
 from prim.shapes import Kind, Primitive

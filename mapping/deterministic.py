@@ -8,8 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapping.grid import UNKNOWN, GridFrame, Layer, OccupancyGrid
-from mapping.rays import FREE, OCCUPIED, UNSEEN, end_extent, mark
-from prim.frames import Pose2D, Scan
+from mapping.kernels import FREE, OCCUPIED, UNSEEN, end_extent, mark
+from prim.scan import Scan
+from prim.se2 import Pose2D
 from prim.world import Bounds
 
 _PROBABILITY = np.array([0.0, 1.0, UNKNOWN], dtype=np.float32)

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from mapping.rays import BORDER_SLACK
+from mapping.kernels import BORDER_SLACK
 from prim.errors import UsageError
 from prim.world import Bounds
 

@@ -8,11 +8,12 @@ from typing import Protocol
 import numpy as np
 
 from mapping.deterministic import DeterministicMapper
-from mapping.forward import ForwardMapper
+from mapping.forward.mapper import ForwardMapper
 from mapping.grid import OccupancyGrid
 from mapping.probabilistic import ProbabilisticMapper
 from prim.errors import UsageError
-from prim.frames import Pose2D, Scan
+from prim.scan import Scan
+from prim.se2 import Pose2D
 from prim.world import Bounds
 
 

@@ -8,9 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapping.grid import Layer, OccupancyGrid
-from mapping.rays import MARGIN_CELLS, add_log_odds, end_extent
-from prim.frames import Pose2D, Scan
-from prim.raycast import FloatArray
+from mapping.kernels import MARGIN_CELLS, add_log_odds, end_extent
+from prim.arrays import FloatArray
+from prim.scan import Scan
+from prim.se2 import Pose2D
 from prim.world import Bounds
 
 FREE_PROBABILITY = 0.3

@@ -4,25 +4,19 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from typing import SupportsInt
 
 import numpy as np
-from numpy.typing import NDArray
 
-from prim.raycast import FloatArray
+from prim.arrays import FloatArray
 from prim.shapes import Primitive, angle_error
-
-BoolGrid = NDArray[np.bool_]
 
 FOUND_IOU = 0.5
 """A primitive counts as found when the kind agrees and the polygons' IoU is at least this."""
 
 OVERLAY_GRID = 1e-9
 """Vertices are rounded to this (m) before polygons meet: without it, some that all but agree share nothing."""
-
-TOLERANCE_CELLS = 1
-"""How far (cells, 8 neighbours) an occupied cell may lie from the truth's and still count."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,21 +54,6 @@ class DetectionErrors:
     height: float | None
     iou: float | None
     pairs: tuple[Pair, ...]
-
-
-@dataclass(frozen=True, slots=True)
-class MapScores:
-    """How a map's cells agree with the truth's; a score is None where it has no cells to count."""
-
-    occupied_precision: float | None
-    occupied_recall: float | None
-    occupied_f1: float | None
-    free_accuracy: float | None
-    auc: float | None
-
-    def to_json(self) -> dict[str, float | None]:
-        """As the report holds them."""
-        return asdict(self)
 
 
 def polygon_iou(a: Primitive, b: Primitive) -> float:
@@ -121,7 +100,7 @@ def detection_errors(detections: Sequence[Primitive], truth: Sequence[Primitive]
     return DetectionErrors(
         precision=precision,
         recall=recall,
-        f1=_f1(precision, recall),
+        f1=f1_score(precision, recall),
         position=_mean(pair.position for pair in found),
         angle=_mean(pair.angle for pair in found if pair.angle is not None),
         width=_mean(pair.width for pair in found),
@@ -129,48 +108,6 @@ def detection_errors(detections: Sequence[Primitive], truth: Sequence[Primitive]
         iou=_mean(pair.iou for pair in found),
         pairs=tuple(pairs),
     )
-
-
-def map_scores(
-    probability: NDArray[np.floating],
-    occupied: BoolGrid,
-    free: BoolGrid,
-    tolerance: int = TOLERANCE_CELLS,
-) -> MapScores:
-    """Scores of a map against the cells that are truly ``occupied`` and truly ``free``, all (rows, cols).
-
-    The map calls a cell occupied where its probability is above 0.5 and free where it is below. Precision: of
-    the cells called occupied that are truly occupied (within ``tolerance`` cells, 8 neighbours) or truly free,
-    the share of the former; cells that no beam can reach do not count. Recall: the share of truly occupied
-    cells with one called occupied within the tolerance. Free accuracy: the share of truly free cells called
-    free. AUC: the chance that a truly occupied cell has a higher probability than a truly free one.
-    """
-    called = probability > 0.5
-    near_truth = dilate(occupied, tolerance)
-    right = np.count_nonzero(called & near_truth)
-    wrong = np.count_nonzero(called & free & ~near_truth)
-    precision = _share(right, right + wrong)
-    recall = _share(np.count_nonzero(occupied & dilate(called, tolerance)), np.count_nonzero(occupied))
-    return MapScores(
-        occupied_precision=precision,
-        occupied_recall=recall,
-        occupied_f1=None if recall is None else _f1(precision or 0.0, recall),
-        free_accuracy=_share(np.count_nonzero(free & (probability < 0.5)), np.count_nonzero(free)),
-        auc=_auc(probability[occupied], probability[free]),
-    )
-
-
-def dilate(cells: BoolGrid, steps: int) -> BoolGrid:
-    """The cells and all within ``steps`` cells of them (8 neighbours)."""
-    grown = cells.copy()
-    for axis in (0, 1):
-        line = grown.copy()
-        for step in range(1, steps + 1):
-            ahead, behind = [slice(None)] * 2, [slice(None)] * 2
-            ahead[axis], behind[axis] = slice(step, None), slice(None, -step)
-            grown[tuple(ahead)] |= line[tuple(behind)]
-            grown[tuple(behind)] |= line[tuple(ahead)]
-    return grown
 
 
 def pose_rmse(estimate: FloatArray, truth: FloatArray) -> tuple[float, float]:
@@ -203,21 +140,13 @@ def _pair(i: int, j: int, detection: Primitive, truth: Primitive) -> Pair:
     )
 
 
-def _auc(occupied: NDArray[np.floating], free: NDArray[np.floating]) -> float | None:
-    """Area under the ROC curve: the Mann-Whitney statistic, ties counted half."""
-    if not len(occupied) or not len(free):
-        return None
-    ranked = np.sort(free)
-    below = np.searchsorted(ranked, occupied, side="left").mean()
-    not_above = np.searchsorted(ranked, occupied, side="right").mean()
-    return float((below + not_above) / (2 * len(free)))
-
-
-def _f1(precision: float, recall: float) -> float:
+def f1_score(precision: float, recall: float) -> float:
+    """The harmonic mean of precision and recall; 0 where both are."""
     return 2 * precision * recall / (precision + recall) if precision + recall else 0.0
 
 
-def _share(part: SupportsInt, whole: SupportsInt) -> float | None:
+def share_of_all(part: SupportsInt, whole: SupportsInt) -> float | None:
+    """The share of a count in another; None of nothing."""
     return int(part) / int(whole) if int(whole) else None
 
 

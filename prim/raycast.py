@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
-FloatArray = NDArray[np.float64]
+from prim.arrays import FloatArray
 
 END_SLACK = 1e-12
 """A segment reaches this share beyond its ends, so that no ray slips between two that meet."""

@@ -26,7 +26,8 @@ from typing import Any
 
 import numpy as np
 
-from prim.raycast import FloatArray, cast_ellipses, cast_segments
+from prim.arrays import FloatArray
+from prim.raycast import cast_ellipses, cast_segments
 
 SIDES_AGREE = 0.03
 """Sides that differ by no more than this share make a shape look more symmetric than its kind is."""

@@ -12,8 +12,9 @@ from typing import Any
 
 import numpy as np
 
+from prim.arrays import FloatArray
 from prim.errors import WorldError
-from prim.raycast import FloatArray, cast_ellipses, cast_segments
+from prim.raycast import cast_ellipses, cast_segments
 from prim.shapes import Primitive
 
 Wall = tuple[float, float, float, float]

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from prim.errors import UsageError
-from prim.frames import Pose2D, wrap_angle
+from prim.se2 import Pose2D, wrap_angle
 from prim.world import World
 from recorder.simulator import AXLE, ROBOT_RADIUS, Simulator
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from prim.frames import Pose2D
+from prim.se2 import Pose2D
 
 
 @dataclass(frozen=True)

@@ -7,9 +7,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from prim.frames import Pose2D, Scan, beam_directions
-from prim.messages import LASER_FRAME
-from prim.raycast import FloatArray
+from prim.arrays import FloatArray
+from prim.log.messages import LASER_FRAME
+from prim.scan import Scan, beam_directions
+from prim.se2 import Pose2D
 from prim.world import World
 
 

@@ -12,9 +12,7 @@ import numpy as np
 
 from prim import __version__
 from prim.errors import UsageError
-from prim.frames import Pose2D
-from prim.log import LogWriter
-from prim.messages import (
+from prim.log.messages import (
     BASE_FRAME,
     COMPASS_TOPIC,
     GPS_TOPIC,
@@ -41,6 +39,8 @@ from prim.messages import (
     encode_scan,
     encode_transforms,
 )
+from prim.log.writer import LogWriter
+from prim.se2 import Pose2D
 from prim.world import World
 from recorder.motion import Step, drive, warp
 from recorder.odometry import Odometry, OdometryNoise

@@ -12,7 +12,7 @@ from dataclasses import replace
 
 import pymunk
 
-from prim.frames import Pose2D
+from prim.se2 import Pose2D
 from prim.shapes import Kind, Primitive
 from prim.world import World
 

@@ -21,9 +21,10 @@ from prim.errors import PrimError, UsageError
 
 if TYPE_CHECKING:
     from prim.world import Bounds
-    from replay.localize import FuseOptions
-    from replay.pipeline import ReplayOptions, ReplayResult
-    from replay.show import Viewer, ViewerOptions
+    from replay.options import ReplayOptions
+    from replay.poses.localize import FuseOptions
+    from replay.result import ReplayResult
+    from replay.viewer_protocol import Viewer, ViewerOptions
 
 PARTLY_LOST = 3
 """The exit code when part of a log could not be read."""
@@ -163,10 +164,10 @@ def replay(
 
     Each log leaves a recording and a report in this folder: NAME.MAPPER.rrd and NAME.MAPPER.report.json.
     """
-    from prim.frames import Pose2D
-    from replay.pipeline import ReplayOptions
-    from replay.scans import Selection
-    from replay.show import ViewerOptions
+    from prim.se2 import Pose2D
+    from replay.options import ReplayOptions
+    from replay.selection import Selection
+    from replay.viewer_protocol import ViewerOptions
 
     shown = ViewerOptions(save, spawn, connect, serve, live=rate is not None)
     if no_viewer and (shown != ViewerOptions(live=shown.live) or map_every or detect_every):
@@ -223,7 +224,7 @@ class Outputs:
     @property
     def files(self) -> list[Path]:
         """All the files."""
-        from replay.report import map_files
+        from replay.exports import map_files
 
         one_file = (self.recording, self.report, self.trajectory)
         return [path for path in one_file if path] + (list(map_files(self.map)) if self.map else [])
@@ -258,8 +259,8 @@ class Talk:
 
 def _replay_log(log: Path, options: ReplayOptions, outputs: Outputs, shown: ViewerOptions | None, talk: Talk) -> int:
     """Replays one log, writes its outputs, prints its table; returns the exit code."""
+    from replay.exports import check_writable, write_map, write_report, write_trajectory
     from replay.pipeline import Pipeline
-    from replay.report import check_writable, write_map, write_report, write_trajectory
 
     for path in outputs.files:
         check_writable(path)
@@ -328,8 +329,8 @@ def _fuse_options(
     odom_noise: tuple[float, float] | None,
 ) -> FuseOptions:
     """What poses are fused from, and how noisy that is. Raises UsageError."""
-    from replay.fusion import PoseNoise
-    from replay.localize import SENSORS, FuseOptions
+    from replay.poses.fusion import PoseNoise
+    from replay.poses.localize import SENSORS, FuseOptions
 
     names = SENSORS if sensors is None else tuple(name.strip() for name in sensors.split(","))
     unknown = [name for name in names if name not in SENSORS]

@@ -5,37 +5,37 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
-from mapping.forward import find_noise
+from detect.networks.weights import shipped_weights
+from mapping.forward.mapper import find_noise
 from mapping.grid import GridFrame, OccupancyGrid
-from mapping.mapper import Mapper, check_mapper, make_mapper
-from mapping.rays import end_extent
-from mapping.truth import TruthMap
+from mapping.kernels import end_extent
+from mapping.map_metrics import MapScores
+from mapping.mapper import Mapper, make_mapper
+from prim.arrays import FloatArray
 from prim.errors import LogReadError, UsageError, WorldError
-from prim.frames import Pose2D, Scan
-from prim.log import LogReader
-from prim.metrics import MapScores, pose_nees, pose_rmse
-from prim.raycast import FloatArray
-from prim.shapes import angle_difference
-from prim.world import Bounds, World
-from replay.fusion import PoseNoise
-from replay.localize import FUSED, STILL, FuseOptions, LaserPoses, Localizer
-from replay.lookout import Lookout, Sighting, shipped_weights
-from replay.scans import PosedScan, ScanLog, Selection, counted, pieces_of, turned_over
-from replay.show import NullViewer, Scene, Viewer
-from replay.truth import Truth
+from prim.log.mcap import LogReader
+from prim.scan import PosedScan, Scan, pieces_of, turned_over
+from prim.se2 import Pose2D
+from prim.world import World
+from replay.detection import Lookout, Sighting
+from replay.evaluation import Judge
+from replay.ground_truth import Truth
+from replay.options import ReplayOptions
+from replay.posed_scans import ScanLog, counted
+from replay.poses.fusion import PoseNoise
+from replay.poses.localize import FUSED, FuseOptions, LaserPoses, Localizer
+from replay.result import ReplayResult
+from replay.viewer_protocol import NullViewer, Scene, Viewer
 
 WORLD_MARGIN = 0.1
 """Automatic bounds reach this far (m) beyond the recorded world."""
 
-MAX_OFFSET = 1000.0
-"""No laser stands further (m) from its robot's origin."""
 
 MAX_WAIT = 10.0
 """A replay at a rate waits no longer (s) for the next scan, however long the log paused."""
@@ -48,93 +48,6 @@ NOISE_SCANS = 200
 """The noise is found from about so many scans, evenly spread over the log, where only the noise is wanted."""
 
 Progress = Callable[[int, int], None]
-
-
-@dataclass(frozen=True)
-class ReplayOptions:
-    """How one log is replayed; lengths in metres, times in seconds. Raises UsageError on impossible values."""
-
-    mapper: str = "det"
-    sensor_model: str = "eq4"
-    noise_std: float | None = None
-    pose: str = "auto"
-    resolution: float = 0.01
-    bounds: Bounds | None = None
-    scan_topic: str | None = None
-    odom_topic: str | None = None
-    laser_offset: Pose2D | None = None
-    max_range: float | None = None
-    standing_still: bool = False
-    fuse: FuseOptions = field(default_factory=FuseOptions)
-    deskew: bool = True
-    match_scans: bool = False
-    selection: Selection = field(default_factory=Selection)
-    rate: float | None = None
-    map_every: int | None = None
-    detect: bool = True
-    detect_every: int | None = None
-    refine: bool = True
-    weights: Path | None = None
-    recover: bool = False
-
-    def __post_init__(self) -> None:
-        check_mapper(self.mapper, self.sensor_model, self.noise_std)
-        if not (0 < self.resolution < np.inf):
-            raise UsageError(f"--resolution is {self.resolution:g}: it must be above 0")
-        if self.bounds is not None and not (self.bounds[0] < self.bounds[2] and self.bounds[1] < self.bounds[3]):
-            raise UsageError("--bounds X0 Y0 X1 Y1: X0 must be below X1 and Y0 below Y1")
-        if self.rate is not None and not (0 < self.rate < np.inf):
-            raise UsageError(f"--rate is {self.rate:g}: it must be above 0")
-        if self.max_range is not None and not self.max_range > 0:
-            raise UsageError(f"--max-range is {self.max_range:g}: it must be above 0")
-        if self.map_every is not None and self.map_every < 1:
-            raise UsageError(f"--map-every is {self.map_every}: it must be at least 1")
-        if self.detect_every is not None and self.detect_every < 1:
-            raise UsageError(f"--detect-every is {self.detect_every}: it must be at least 1")
-        if not self.detect and (self.detect_every or self.weights or not self.refine):
-            raise UsageError("--no-detect excludes --detect-every, --weights and --no-refine")
-        self._check_poses()
-
-    def _check_poses(self) -> None:
-        if self.standing_still and (self.pose != "auto" or self.odom_topic):
-            raise UsageError("--standing-still excludes --pose and --odom-topic")
-        if self.standing_still and (self.match_scans or self.fuse != FuseOptions()):
-            raise UsageError("--standing-still excludes --match-scans and all that says how poses are fused")
-        fuses = self.pose in ("auto", FUSED)
-        if not fuses and replace(self.fuse, noise=PoseNoise()) != FuseOptions():
-            raise UsageError(f"--fuse, --gps-topic and --compass-topic do not go with --pose {self.pose}")
-        if not fuses and not self.match_scans and self.fuse.noise != PoseNoise():
-            raise UsageError("--pose-noise and --odom-noise go with --pose fused or with --match-scans")
-        if self.odom_topic and self.pose not in ("auto", "odom", FUSED):
-            raise UsageError(f"--odom-topic goes with --pose odom, not with --pose {self.pose}")
-        offset = self.laser_offset
-        if offset is not None and not (np.abs((offset.x, offset.y, offset.theta)) < MAX_OFFSET).all():
-            raise UsageError(f"--laser-offset is {offset.x:g} {offset.y:g}: it must be metres on a robot")
-
-
-@dataclass(frozen=True)
-class ReplayResult:
-    """All that a replay found out; ``blind`` says why primitives were not looked for, where they should have been."""
-
-    path: Path
-    options: ReplayOptions
-    duration: float
-    scans: int
-    scans_used: int
-    rays: int
-    lost: tuple[str, ...]
-    notes: tuple[str, ...]
-    messages_lost: int | None
-    poses: LaserPoses
-    stamps: NDArray[np.int64]
-    pose_rmse: tuple[float, float] | None
-    pose_nees: float | None
-    grid: OccupancyGrid
-    noise_std: float | None
-    scores: MapScores | None
-    sighting: Sighting | None
-    blind: str | None
-    seconds: dict[str, float]
 
 
 @dataclass
@@ -282,7 +195,7 @@ class Pipeline:
 
     def _matched(self, scans: ScanLog, poses: LaserPoses) -> LaserPoses:
         """The poses corrected by a map that is made of the scans."""
-        from replay.matching import match  # when it is needed: a replay without it starts faster
+        from replay.poses.scan_matching import match  # when it is needed: a replay without it starts faster
 
         options = self.options
         posed = partial(self._posed, scans)
@@ -360,7 +273,7 @@ class Pipeline:
             detector = Detector.load(weights, options.mapper)
         tracker = None
         if options.detect_every is not None:
-            from detect.tracks import Tracker
+            from detect.tracker import Tracker
 
             tracker = Tracker()
         cell = detector.card.resolution
@@ -525,62 +438,6 @@ class Pipeline:
             blind=self._blind,
             seconds=self._clock.seconds | {"total": self._clock.total()},
         )
-
-
-class Judge:
-    """Holds the replay against the truth, where the log has one."""
-
-    def __init__(
-        self, frame: GridFrame, truth: Truth | None, poses: LaserPoses, true_poses: LaserPoses | None
-    ) -> None:
-        self._truth = truth
-        self._poses = poses
-        self._true_poses = true_poses
-        self._map = TruthMap(frame) if truth is not None and true_poses is not None else None
-
-    @property
-    def scores_maps(self) -> bool:
-        """Whether the map is held against the true world."""
-        return self._map is not None
-
-    @property
-    def compares_poses(self) -> bool:
-        """Whether the poses are other than the true ones, and held against them."""
-        return self._true_poses is not None and (self._poses.matched or self._poses.source not in ("truth", STILL))
-
-    def update(self, position: int, scan: Scan, stamp: int) -> None:
-        """Adds what a perfect sensor would have seen."""
-        true = self._true_poses
-        if self._map is None or self._truth is None or true is None or not true.valid[position]:
-            return
-        self._map.update(scan, Pose2D(*true.poses[position].tolist()), self._truth.at(stamp))
-
-    def score(self, grid: OccupancyGrid) -> MapScores | None:
-        """Scores of the map so far; None without truth."""
-        return None if self._map is None else self._map.score(grid.probability)
-
-    def pose_error(self, position: int) -> tuple[float, float] | None:
-        """Position (m) and heading (rad) error of one scan's pose; None where poses are not compared."""
-        if self._true_poses is None or not self.compares_poses or not self._true_poses.valid[position]:
-            return None
-        pose, true = self._poses.poses[position], self._true_poses.poses[position]
-        return float(np.hypot(*(pose - true)[:2])), abs(angle_difference(float(pose[2]), float(true[2])))
-
-    def pose_rmse(self) -> tuple[float, float] | None:
-        """Root mean square position (m) and heading (rad) errors; None where poses are not compared."""
-        if self._true_poses is None or not self.compares_poses:
-            return None
-        both = self._poses.valid & self._true_poses.valid
-        return pose_rmse(self._poses.poses[both], self._true_poses.poses[both]) if both.any() else None
-
-    def pose_nees(self) -> float | None:
-        """The mean normalised error squared: 3 where the covariances are right; None where there are none."""
-        if self._true_poses is None or self._poses.covariances is None:
-            return None
-        both = self._poses.valid & self._true_poses.valid
-        if not both.any():
-            return None
-        return pose_nees(self._poses.poses[both], self._true_poses.poses[both], self._poses.covariances[both])
 
 
 class Pace:

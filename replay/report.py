@@ -2,24 +2,18 @@
 
 from __future__ import annotations
 
-import errno
-import json
-import os
 from collections.abc import Iterator
-from contextlib import contextmanager
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from mapping.grid import OccupancyGrid
-from prim.errors import OutputError
 from prim.metrics import DetectionErrors
 from prim.shapes import Kind
-from replay.localize import COMPASS, GPS, ODOM, LaserPoses, Sensor
-from replay.lookout import Sighting
-from replay.pipeline import ReplayResult
-from replay.scans import counted
+from replay.detection import Sighting
+from replay.posed_scans import counted
+from replay.poses.localize import COMPASS, GPS, ODOM, LaserPoses, Sensor
+from replay.result import ReplayResult
 
 UNITS = {ODOM: ("m", "rad"), GPS: ("m",), COMPASS: ("rad",)}
 """What the noise of each sensor is told in."""
@@ -31,9 +25,6 @@ LEAST_RAY_NOISE = 0.002
 
 CELLS_LIMIT = 1.5
 """Noise below this many cells cannot be told from the cells' own size."""
-
-FREE_THRESHOLD, OCCUPIED_THRESHOLD = 0.196, 0.65
-"""nav2's map_server calls cells below the one free and above the other occupied; 205 is 0.19608, unknown."""
 
 
 def report(result: ReplayResult) -> dict[str, Any]:
@@ -163,58 +154,6 @@ def _evidence(grid: OccupancyGrid) -> dict[str, Any] | None:
     return {"cells_known": len(known), "rays_per_cell_quartiles": quartiles}
 
 
-def check_writable(path: Path) -> None:
-    """Raises OutputError where a file could not be written, before the work that would be lost."""
-    with _writing(path):
-        if path.is_dir():
-            raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR))
-        if not path.parent.is_dir():
-            raise FileNotFoundError(errno.ENOENT, os.strerror(errno.ENOENT))
-        if not os.access(path if path.exists() else path.parent, os.W_OK):
-            raise PermissionError(errno.EACCES, os.strerror(errno.EACCES))
-
-
-def write_report(path: Path, result: ReplayResult) -> None:
-    """Writes the report as JSON. Raises OutputError."""
-    with _writing(path):
-        path.write_text(json.dumps(report(result), indent=2) + "\n", encoding="utf-8")
-
-
-def write_map(stem: Path, grid: OccupancyGrid) -> None:
-    """Writes ``stem.pgm`` and ``stem.yaml`` as nav2's map_server reads them. Raises OutputError.
-
-    An image's first row is the map's largest y. Cells called occupied are black, free ones white, unknown
-    ones 205, which its ``trinary`` mode reads back as they were.
-    """
-    image = np.full(grid.frame.shape, 205, dtype=np.uint8)
-    image[grid.free] = 254
-    image[grid.occupied] = 0
-    rows, cols = grid.frame.shape
-    pgm, yaml = map_files(stem)
-    x, y = grid.frame.origin
-    with _writing(pgm):
-        pgm.write_bytes(f"P5\n{cols} {rows}\n255\n".encode() + np.flipud(image).tobytes())
-    with _writing(yaml):
-        yaml.write_text(
-            f"image: {pgm.name}\nmode: trinary\nresolution: {grid.frame.resolution:g}\n"
-            f"origin: [{x:.9g}, {y:.9g}, 0]\nnegate: 0\n"
-            f"occupied_thresh: {OCCUPIED_THRESHOLD}\nfree_thresh: {FREE_THRESHOLD}\n",
-            encoding="utf-8",
-        )
-
-
-def write_trajectory(path: Path, result: ReplayResult) -> None:
-    """Writes the laser's poses in TUM's format (stamp x y z qx qy qz qw). Raises OutputError."""
-    lines = []
-    for stamp, pose, valid in zip(result.stamps.tolist(), result.poses.poses, result.poses.valid, strict=True):
-        if valid:
-            x, y, half = pose[0], pose[1], pose[2] / 2
-            seconds = f"{stamp // 10**9}.{stamp % 10**9:09d}"
-            lines.append(f"{seconds} {x:.9f} {y:.9f} 0 0 0 {np.sin(half):.9f} {np.cos(half):.9f}\n")
-    with _writing(path):
-        path.write_text("".join(lines), encoding="utf-8")
-
-
 def table(result: ReplayResult) -> list[tuple[str, str]]:
     """The rows of the short table at the end: name, value with its unit."""
     frame, seconds, scores = result.grid.frame, result.seconds, result.scores
@@ -299,17 +238,3 @@ def _noise(std: float, given: bool, resolution: float) -> str:
 
 def _percent(share: float | None) -> str:
     return "-" if share is None else f"{share:.1%}"
-
-
-def map_files(stem: Path) -> tuple[Path, Path]:
-    """The image and the description of a map that is called ``stem``, with or without either's suffix."""
-    name = stem.name.removesuffix(".yaml").removesuffix(".pgm")
-    return stem.with_name(f"{name}.pgm"), stem.with_name(f"{name}.yaml")
-
-
-@contextmanager
-def _writing(path: Path) -> Iterator[None]:
-    try:
-        yield
-    except OSError as error:
-        raise OutputError(path, error) from error

@@ -18,19 +18,20 @@ import rerun.blueprint as rrb
 from numpy.typing import NDArray
 
 from mapping.grid import OccupancyGrid
+from mapping.map_metrics import MapScores
+from prim.arrays import FloatArray
 from prim.errors import OutputError, PrimError, UsageError
-from prim.frames import Pose2D
-from prim.metrics import DetectionErrors, MapScores
-from prim.raycast import FloatArray
+from prim.metrics import DetectionErrors
+from prim.se2 import Pose2D
 from prim.shapes import Kind, Primitive
 from prim.world import World
-from replay.lookout import Sighting
-from replay.pipeline import ReplayResult
+from replay.detection import Sighting
 from replay.report import table
-from replay.show import Scene, ViewerOptions
+from replay.result import ReplayResult
+from replay.viewer_protocol import Scene, ViewerOptions
 
 if TYPE_CHECKING:
-    from detect.detector import Detection
+    from detect.detection import Detection
 
 APPLICATION = "prim"
 STAMP, SCAN = "stamp", "scan"

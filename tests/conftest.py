@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from hypothesis import settings
 
-from prim.frames import Scan
+from prim.scan import Scan
 from recorder.sensors import Lidar
 from recorder.session import Session, SessionOptions, record
 from recorder.world import WorldOptions

@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from detect.weights import Card, Weights
-from detect.yolo import KINDS
+from detect.networks.weights import Card, Weights
+from detect.networks.yolo import KINDS
 
 Answer = Callable[[NDArray[np.float32]], NDArray[np.float32]]
 

@@ -9,10 +9,9 @@ import numpy as np
 import pytest
 
 from detect import cli
-from detect.tiles import TILE
-from detect.weights import load_weights
+from detect.networks.tiles import TILE
+from detect.networks.weights import SHIPPED, load_weights
 from prim import console
-from replay.lookout import SHIPPED
 
 Run = Callable[..., tuple[int, str, str]]
 
@@ -102,7 +101,7 @@ def test_training_begins_where_it_is_told_to(run: Run) -> None:
     torch = pytest.importorskip("torch", reason="needs the extra [train]")
     from dataclasses import replace
 
-    from detect.train import YoloOptions, train_yolo
+    from detect.training.train import YoloOptions, train_yolo
 
     run("dataset", "set", "--maps", 4, 2, "--mapper", "det", "--kind", "circle", "--noise-std", 0.0)
     options = YoloOptions(epochs=1, batch=4, mosaic=False, turn=False, seed=3)

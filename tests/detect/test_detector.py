@@ -8,10 +8,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from detect.detector import BATCH, Detector
-from detect.estimator import Estimator
-from detect.tiles import TILE
-from detect.weights import ALL_KINDS, Card, WeightsError
-from detect.yolo import Boxes, Yolo, suppress
+from detect.networks.cnn import Estimator
+from detect.networks.tiles import TILE
+from detect.networks.weights import ALL_KINDS, Card, WeightsError
+from detect.networks.yolo import Boxes, Yolo, suppress
 from mapping.grid import GridFrame, OccupancyGrid
 from prim.errors import UsageError
 from prim.shapes import Kind
@@ -152,7 +152,7 @@ def test_many_are_suppressed_as_few_are(seed: int, per_kind: bool) -> None:
     )
     few = suppress(boxes, 0.3, per_kind)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("detect.yolo.MANY", 10)
+        patch.setattr("detect.networks.yolo.MANY", 10)
         assert suppress(boxes, 0.3, per_kind).tolist() == few.tolist()
 
 

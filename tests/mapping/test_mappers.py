@@ -19,9 +19,10 @@ from mapping.probabilistic import (
     log_odds,
     probability_of,
 )
-from mapping.truth import TruthMap
+from mapping.reference_map import TruthMap
 from prim.errors import UsageError
-from prim.frames import Pose2D, Scan
+from prim.scan import Scan
+from prim.se2 import Pose2D
 from prim.world import World
 from recorder.sensors import Lidar
 from recorder.session import Session
@@ -213,9 +214,10 @@ def test_unknown_mapper_and_too_large_a_grid() -> None:
 
 def map_of(session: Session, name: str, scans: int | None = None) -> tuple[OccupancyGrid, TruthMap]:
     """A session's map with the session's own poses, and its truth."""
-    from prim.log import LogReader
-    from replay.localize import Localizer
-    from replay.scans import ScanLog, Selection
+    from prim.log.mcap import LogReader
+    from replay.posed_scans import ScanLog
+    from replay.poses.localize import Localizer
+    from replay.selection import Selection
 
     mapper = make_mapper(name, 0.01, (-1.1, -1.1, 1.1, 1.1))
     truth = TruthMap(mapper.grid().frame)

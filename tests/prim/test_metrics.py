@@ -7,7 +7,9 @@ import shapely
 from hypothesis import given
 from hypothesis import strategies as st
 
-from prim.metrics import detection_errors, dilate, map_scores, match_primitives, polygon_iou, pose_rmse
+from mapping.map_metrics import map_scores
+from mapping.morphology import dilate
+from prim.metrics import detection_errors, match_primitives, polygon_iou, pose_rmse
 from prim.shapes import SIZE_KEYS, Kind, Primitive
 
 

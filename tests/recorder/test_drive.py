@@ -13,9 +13,8 @@ import numpy as np
 import pytest
 import shapely
 
-from prim.frames import Pose2D, Trajectory
-from prim.log import LogReader
-from prim.messages import (
+from prim.log.mcap import LogReader
+from prim.log.messages import (
     ODOMETRY_TYPE,
     POSE_TYPE,
     SCAN_TOPIC,
@@ -26,6 +25,7 @@ from prim.messages import (
     decode_scan,
     planar,
 )
+from prim.se2 import Pose2D, Trajectory
 from prim.shapes import Kind, Primitive
 from prim.world import World
 from recorder.motion import drive
@@ -33,7 +33,8 @@ from recorder.odometry import Odometry, OdometryNoise
 from recorder.sensors import Lidar
 from recorder.session import Session, SessionOptions, record
 from recorder.simulator import ROBOT_RADIUS, Simulator
-from replay.pipeline import Pipeline, ReplayOptions
+from replay.options import ReplayOptions
+from replay.pipeline import Pipeline
 
 
 @pytest.fixture(scope="module")

@@ -9,9 +9,8 @@ from rosbags.typesys import Stores, get_typestore
 
 from prim import console
 from prim.errors import UsageError, WorldError
-from prim.frames import Pose2D
-from prim.log import LogReader
-from prim.messages import (
+from prim.log.mcap import LogReader
+from prim.log.messages import (
     POSE_TYPE,
     SCAN_TOPIC,
     TRUE_POSE_TOPIC,
@@ -19,6 +18,7 @@ from prim.messages import (
     decode_scan,
     planar,
 )
+from prim.se2 import Pose2D
 from prim.shapes import Kind, Primitive
 from prim.world import World
 from recorder.cli import app

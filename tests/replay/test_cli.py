@@ -11,12 +11,12 @@ from typing import Any
 import numpy as np
 import pytest
 
+from detect.networks.weights import shipped_weights
 from mapping.mapper import MAPPERS
 from prim import console
 from recorder.sensors import Lidar
 from recorder.session import Session, SessionOptions, record
 from replay.cli import app, join_bounds
-from replay.lookout import shipped_weights
 
 Run = Callable[..., tuple[int, str, str]]
 
@@ -135,7 +135,8 @@ def test_all_outputs_can_be_named(replay: Run, noisy_session: Session) -> None:
 
 def test_the_nav2_map_reads_back_as_the_grid(replay: Run, noisy_session: Session) -> None:
     """As nav2's map_server reads it: trinary, first image row at the top, the origin at the lower left."""
-    from replay.pipeline import Pipeline, ReplayOptions
+    from replay.options import ReplayOptions
+    from replay.pipeline import Pipeline
 
     assert replay(noisy_session.path, "--mapper", "det", "--map", "m", "--no-viewer")[0] == 0
     yaml = dict(line.split(": ", 1) for line in Path("m.yaml").read_text().splitlines())

@@ -9,8 +9,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from detect.detector import Detection, Detections, Detector, Rejection
-from detect.weights import Card
+from detect.detection import Detection, Detections, Rejection
+from detect.detector import Detector
+from detect.networks.weights import Card
 from mapping.grid import OccupancyGrid
 from mapping.mapper import MAPPERS
 from prim import console
@@ -18,11 +19,13 @@ from prim.errors import UsageError
 from prim.shapes import Kind, Primitive
 from recorder.session import Session
 from replay import cli
-from replay.lookout import spread_by_frame
-from replay.pipeline import Pipeline, ReplayOptions, ReplayResult
+from replay.detection import spread_by_frame
+from replay.options import ReplayOptions
+from replay.pipeline import Pipeline
 from replay.report import report, table
-from replay.show import ViewerOptions
+from replay.result import ReplayResult
 from replay.viewer import RerunViewer
+from replay.viewer_protocol import ViewerOptions
 from tests.replay.test_viewer import rows_of, timed, value
 
 
@@ -167,7 +170,7 @@ def test_weights_that_cannot_be_used(
 
 
 def test_without_weights_the_table_says_so(noisy_session: Session, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("replay.lookout.SHIPPED", Path("nowhere"))
+    monkeypatch.setattr("detect.networks.weights.SHIPPED", Path("nowhere"))
     result = Pipeline(noisy_session.path, ReplayOptions()).run()
     assert "not looked for: no weights for maps of det" in dict(table(result))["primitives"] and not result.notes
     with pytest.raises(UsageError, match="give --weights"):

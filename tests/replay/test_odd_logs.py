@@ -12,9 +12,18 @@ import pytest
 from mcap.writer import Writer
 
 from prim import console
-from prim.frames import Pose2D, Scan
-from prim.log import LogWriter
-from prim.messages import ODOMETRY_TYPE, POINT_TYPE, POSE_TYPE, SCAN_TYPE, encode_odometry, encode_point, encode_scan
+from prim.log.messages import (
+    ODOMETRY_TYPE,
+    POINT_TYPE,
+    POSE_TYPE,
+    SCAN_TYPE,
+    encode_odometry,
+    encode_point,
+    encode_scan,
+)
+from prim.log.writer import LogWriter
+from prim.scan import Scan
+from prim.se2 import Pose2D
 from replay.cli import app
 
 SECOND = 10**9
@@ -142,7 +151,7 @@ def test_a_world_that_is_none_is_said(replay: Replay) -> None:
 
 
 def test_true_poses_without_a_world_still_judge_the_poses(replay: Replay) -> None:
-    from prim.messages import encode_pose
+    from prim.log.messages import encode_pose
 
     true = [(s * SECOND, encode_pose(s * SECOND, Pose2D(0.3, 0.4, 0.0))) for s in range(5)]
     odometry = [(s * SECOND, encode_odometry(s * SECOND, Pose2D())) for s in range(5)]
@@ -224,7 +233,7 @@ def write_chunks(path: Path, *chunks: tuple[int, ...], uncounted: int = 0) -> Pa
 @pytest.mark.parametrize("chunks", [((1, 5, 3), (4, 2, 6)), ((2, 3, 1), (6, 4, 5)), ((4, 5, 6), (1, 2, 3))])
 def test_messages_come_in_the_order_of_their_times(tmp_path: Path, chunks: tuple[tuple[int, ...], ...]) -> None:
     """Chunks whose times interleave, chunks that are not sorted in themselves, chunks in the other order."""
-    from prim.log import LogReader
+    from prim.log.mcap import LogReader
 
     with LogReader(write_chunks(tmp_path / "a.mcap", *chunks)) as log:
         assert [message.log_time // SECOND for message in log.messages("/scan")] == [1, 2, 3, 4, 5, 6]

@@ -8,9 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from prim.frames import Pose2D
-from prim.log import LogWriter
-from prim.messages import (
+from prim.log.messages import (
     MARKERS_TYPE,
     POSE_TYPE,
     SCAN_TYPE,
@@ -19,12 +17,16 @@ from prim.messages import (
     encode_primitives,
     encode_scan,
 )
+from prim.log.writer import LogWriter
+from prim.se2 import Pose2D
 from prim.shapes import Kind, Primitive
 from prim.world import World
 from recorder.sensors import Lidar
 from recorder.session import Session
-from replay.pipeline import Clock, Pipeline, ReplayOptions, ReplayResult
-from tests.replay.test_localize import raw_transform
+from replay.options import ReplayOptions
+from replay.pipeline import Clock, Pipeline
+from replay.result import ReplayResult
+from tests.replay.poses.test_localize import raw_transform
 
 STAMP = 5 * 10**9
 POSE = Pose2D(0.2, -0.1, 0.7)

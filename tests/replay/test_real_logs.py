@@ -10,10 +10,12 @@ import pytest
 
 from mapping.mapper import MAPPERS
 from prim import console
-from prim.frames import Pose2D
-from prim.raycast import FloatArray
+from prim.arrays import FloatArray
+from prim.se2 import Pose2D
 from replay.cli import app
-from replay.pipeline import Pipeline, ReplayOptions, ReplayResult
+from replay.options import ReplayOptions
+from replay.pipeline import Pipeline
+from replay.result import ReplayResult
 
 Find = Callable[[str], Path]
 every = pytest.mark.parametrize("mapper", MAPPERS)

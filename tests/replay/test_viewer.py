@@ -13,14 +13,16 @@ import pytest
 import rerun as rr
 
 from mapping.grid import OccupancyGrid
-from prim.frames import Pose2D
-from prim.log import LogReader
-from prim.messages import SCAN_TOPIC, decode_scan
+from prim.log.mcap import LogReader
+from prim.log.messages import SCAN_TOPIC, decode_scan
+from prim.se2 import Pose2D
 from recorder.session import Session
-from replay.pipeline import Pipeline, ReplayOptions, ReplayResult
-from replay.scans import Selection
-from replay.show import ViewerOptions
+from replay.options import ReplayOptions
+from replay.pipeline import Pipeline
+from replay.result import ReplayResult
+from replay.selection import Selection
 from replay.viewer import RerunViewer
+from replay.viewer_protocol import ViewerOptions
 
 RERUN = Path(sys.executable).with_name("rerun")
 SCREENSHOT = Path(__file__).parents[2] / "docs" / "screenshot.py"

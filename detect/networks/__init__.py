@@ -1,0 +1,1 @@
+"""Images to boxes, kinds and first guesses of parameters, on ONNX Runtime."""

@@ -1,0 +1,1 @@
+"""Training sets, networks in torch, and how weights are made."""

@@ -1,0 +1,1 @@
+"""The forward mapper: a forward sensor model fitted by expectation-maximisation."""

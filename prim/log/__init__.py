@@ -1,0 +1,1 @@
+"""Logs: reading, writing, recovering; messages and their bytes."""

@@ -1,0 +1,112 @@
+"""Writing MCAP logs."""
+
+from __future__ import annotations
+
+import errno
+import os
+from collections.abc import Mapping
+from pathlib import Path
+from types import TracebackType
+
+from prim.errors import InterruptedRecordingError, OutputError
+from prim.log.messages import message_definition
+
+CHUNK_BYTES, CHUNK_MESSAGES = 256 * 1024, 600
+"""A chunk ends when it holds this much; the recorder fills one in a fraction of a second."""
+
+
+class LogWriter:
+    """Writes a ROS 2 MCAP log: chunked, zstd, CRCs on.
+
+    Until it is closed the log lies beside ``path`` with ``.part`` at its end. Every chunk is handed to the operating
+    system when it ends, and chunks are small, so that a recorder that is killed loses the last fraction of a second
+    and the rest can be read with ``--recover``. Where a chunk ends depends on the messages and not on the time, so
+    that the same messages make the same bytes. Raises OutputError where the place cannot be written.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.part = path.with_name(path.name + ".part")
+        try:
+            if path.is_dir():
+                raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR))
+            self._file = self.part.open("wb")
+        except OSError as error:
+            raise OutputError(path, error) from error
+        from mcap.writer import CompressionType, Writer  # when it is needed: a replay starts faster
+
+        self._writer = Writer(self._file, chunk_size=1 << 40, compression=CompressionType.ZSTD, enable_crcs=True)
+        self._writer.start(profile="ros2", library="prim")
+        self._channels: dict[str, int] = {}
+        self._messages_in_chunk, self._bytes_in_chunk = 0, 0
+
+    def __enter__(self) -> LogWriter:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        try:
+            self._writer.finish()  # type: ignore[no-untyped-call]
+            self._file.flush()
+            os.fsync(self._file.fileno())
+            self._file.close()
+            if error is None:
+                self.part.replace(self.path)
+        except OSError as failure:
+            raise OutputError(self.path, failure) from failure
+        if isinstance(error, KeyboardInterrupt):
+            raise InterruptedRecordingError(f"interrupted: what was recorded until then is in {self.part}") from error
+
+    def add_metadata(self, name: str, values: Mapping[str, str]) -> None:
+        """Adds a metadata record; call it before the first message."""
+        self._writer.add_metadata(name, dict(values))
+
+    def attach(self, name: str, media_type: str, data: bytes, stamp: int) -> None:
+        """Adds an attachment; call it before the first message."""
+        self._writer.add_attachment(stamp, stamp, name, media_type, data)
+
+    def add_topic(self, topic: str, type_name: str, latched: bool = False) -> None:
+        """Announces a topic; the messages of a ``latched`` one reach late subscribers when it is played back."""
+        schema = self._writer.register_schema(type_name, "ros2msg", message_definition(type_name).encode())
+        profile = _LATCHED_QOS if latched else "[]"
+        self._channels[topic] = self._writer.register_channel(topic, "cdr", schema, {"offered_qos_profiles": profile})
+
+    def write(self, topic: str, stamp: int, data: bytes) -> None:
+        """Writes one CDR message, logged and published at ``stamp`` (ns)."""
+        try:
+            self._writer.add_message(self._channels[topic], stamp, data, stamp)
+            self._messages_in_chunk += 1
+            self._bytes_in_chunk += len(data)
+            if self._messages_in_chunk >= CHUNK_MESSAGES or self._bytes_in_chunk >= CHUNK_BYTES:
+                self.flush()
+        except OSError as error:
+            raise OutputError(self.path, error) from error
+
+    def flush(self) -> None:
+        """Ends the chunk that is being written and hands all there is to the operating system."""
+        self._writer._Writer__finalize_chunk()  # type: ignore[attr-defined]  # nothing public ends a chunk
+        self._file.flush()
+        self._messages_in_chunk, self._bytes_in_chunk = 0, 0
+
+
+_LATCHED_QOS = """\
+- history: keep_last
+  depth: 1
+  reliability: reliable
+  durability: transient_local
+  deadline:
+    sec: 9223372036
+    nsec: 854775807
+  lifespan:
+    sec: 9223372036
+    nsec: 854775807
+  liveliness: automatic
+  liveliness_lease_duration:
+    sec: 9223372036
+    nsec: 854775807
+  avoid_ros_namespace_conventions: false
+"""

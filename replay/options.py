@@ -1,0 +1,81 @@
+"""The options of a replay."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import numpy as np
+
+from mapping.mapper import check_mapper
+from prim.errors import UsageError
+from prim.se2 import Pose2D
+from prim.world import Bounds
+from replay.poses.fusion import PoseNoise
+from replay.poses.localize import FUSED, FuseOptions
+from replay.selection import Selection
+
+MAX_OFFSET = 1000.0
+"""No laser stands further (m) from its robot's origin."""
+
+
+@dataclass(frozen=True)
+class ReplayOptions:
+    """How one log is replayed; lengths in metres, times in seconds. Raises UsageError on impossible values."""
+
+    mapper: str = "det"
+    sensor_model: str = "eq4"
+    noise_std: float | None = None
+    pose: str = "auto"
+    resolution: float = 0.01
+    bounds: Bounds | None = None
+    scan_topic: str | None = None
+    odom_topic: str | None = None
+    laser_offset: Pose2D | None = None
+    max_range: float | None = None
+    standing_still: bool = False
+    fuse: FuseOptions = field(default_factory=FuseOptions)
+    deskew: bool = True
+    match_scans: bool = False
+    selection: Selection = field(default_factory=Selection)
+    rate: float | None = None
+    map_every: int | None = None
+    detect: bool = True
+    detect_every: int | None = None
+    refine: bool = True
+    weights: Path | None = None
+    recover: bool = False
+
+    def __post_init__(self) -> None:
+        check_mapper(self.mapper, self.sensor_model, self.noise_std)
+        if not (0 < self.resolution < np.inf):
+            raise UsageError(f"--resolution is {self.resolution:g}: it must be above 0")
+        if self.bounds is not None and not (self.bounds[0] < self.bounds[2] and self.bounds[1] < self.bounds[3]):
+            raise UsageError("--bounds X0 Y0 X1 Y1: X0 must be below X1 and Y0 below Y1")
+        if self.rate is not None and not (0 < self.rate < np.inf):
+            raise UsageError(f"--rate is {self.rate:g}: it must be above 0")
+        if self.max_range is not None and not self.max_range > 0:
+            raise UsageError(f"--max-range is {self.max_range:g}: it must be above 0")
+        if self.map_every is not None and self.map_every < 1:
+            raise UsageError(f"--map-every is {self.map_every}: it must be at least 1")
+        if self.detect_every is not None and self.detect_every < 1:
+            raise UsageError(f"--detect-every is {self.detect_every}: it must be at least 1")
+        if not self.detect and (self.detect_every or self.weights or not self.refine):
+            raise UsageError("--no-detect excludes --detect-every, --weights and --no-refine")
+        self._check_poses()
+
+    def _check_poses(self) -> None:
+        if self.standing_still and (self.pose != "auto" or self.odom_topic):
+            raise UsageError("--standing-still excludes --pose and --odom-topic")
+        if self.standing_still and (self.match_scans or self.fuse != FuseOptions()):
+            raise UsageError("--standing-still excludes --match-scans and all that says how poses are fused")
+        fuses = self.pose in ("auto", FUSED)
+        if not fuses and replace(self.fuse, noise=PoseNoise()) != FuseOptions():
+            raise UsageError(f"--fuse, --gps-topic and --compass-topic do not go with --pose {self.pose}")
+        if not fuses and not self.match_scans and self.fuse.noise != PoseNoise():
+            raise UsageError("--pose-noise and --odom-noise go with --pose fused or with --match-scans")
+        if self.odom_topic and self.pose not in ("auto", "odom", FUSED):
+            raise UsageError(f"--odom-topic goes with --pose odom, not with --pose {self.pose}")
+        offset = self.laser_offset
+        if offset is not None and not (np.abs((offset.x, offset.y, offset.theta)) < MAX_OFFSET).all():
+            raise UsageError(f"--laser-offset is {offset.x:g} {offset.y:g}: it must be metres on a robot")

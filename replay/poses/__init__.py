@@ -1,0 +1,1 @@
+"""Where the scanner was: transforms, odometry, fusion, scan matching."""

@@ -1,0 +1,201 @@
+"""Networks as files: the same numbers as torch's, and clear errors for files that cannot be used."""
+
+from __future__ import annotations
+
+import json
+import pickle
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from detect.networks.weights import ALL_KINDS, Card, WeightsError, load_set, load_weights
+
+
+@pytest.mark.parametrize(
+    ("content", "said"),
+    [
+        (pickle.dumps({"a": 1}), "pickle"),
+        (b"PK\x03\x04 an archive of torch", "pickle"),
+        (b"", "no ONNX network"),
+        (b"garbage" * 100, "no ONNX network"),
+    ],
+)
+def test_files_that_are_no_networks(tmp_path: Path, content: bytes, said: str) -> None:
+    path = tmp_path / "w.onnx"
+    path.write_bytes(content)
+    with pytest.raises(WeightsError, match=said):
+        load_weights(path, "cnn")
+
+
+def test_a_missing_file_and_a_folder(tmp_path: Path) -> None:
+    for path in (tmp_path / "none.onnx", tmp_path):
+        with pytest.raises(WeightsError, match=str(path)):
+            load_weights(path, "yolo")
+
+
+def test_a_card_reads_back() -> None:
+    card = Card("cnn", "prob", ("circle",), "prim", 1, about={"seed": 3})
+    assert Card.from_json(card.to_json()) == card
+    for text in ("null", "{}", '{"schema": "prim-weights/1"}', '{"schema": "prim-weights/1", "magic": 1}', "[1]"):
+        with pytest.raises(ValueError, match=r"."):
+            Card.from_json(text)
+
+
+@pytest.mark.parametrize("preset", ["prim", "paper"])
+@pytest.mark.parametrize("kinds", [("circle",), ("triangle",), ALL_KINDS], ids=["circle", "triangle", "all"])
+def test_an_exported_network_gives_torch_s_numbers(tmp_path: Path, preset: str, kinds: tuple[str, ...]) -> None:
+    torch = pytest.importorskip("torch", reason="needs the extra [train]")
+    pytest.importorskip("onnx", reason="needs the extra [train]")
+    from dataclasses import asdict
+
+    from detect.networks.parameters import PRESETS
+    from detect.training.export import export_cnn
+    from detect.training.model import ParameterNetwork
+    from detect.training.train import CnnOptions
+    from prim.errors import UsageError
+    from prim.shapes import Kind
+
+    torch.manual_seed(1)
+    network = ParameterNetwork([Kind(kind) for kind in kinds], PRESETS[preset])
+    network.eval()
+    state = {
+        "options": asdict(CnnOptions(preset)),
+        "kinds": list(kinds),
+        "mapper": "forward",
+        "style": "grey",
+        "network": network.state_dict(),
+    }
+    torch.save(state, tmp_path / "a.pt")
+    with pytest.raises(UsageError, match="maps of forward, not of det"):
+        export_cnn(tmp_path / "a.pt", "det", tmp_path / "a.onnx")
+    export_cnn(tmp_path / "a.pt", "forward", tmp_path / "a.onnx")
+    weights = load_weights(tmp_path / "a.onnx", "cnn", "forward")
+    assert (weights.card.kinds, weights.card.preset) == (kinds, preset)
+    crops = np.random.default_rng(0).random((5, 1, *[PRESETS[preset].pixels] * 2), dtype=np.float32)
+    outputs = weights.session.run(None, {"crops": crops})[0]
+    with torch.no_grad():
+        wanted = network(torch.from_numpy(crops)).numpy()
+    assert outputs == pytest.approx(wanted, abs=2e-3)  # weights are kept in half precision
+    assert np.corrcoef(outputs.ravel(), wanted.ravel())[0, 1] > 0.999
+    whole = 4 * sum(parameter.numel() for parameter in network.parameters())
+    assert (tmp_path / "a.onnx").stat().st_size < 0.6 * whole + 20_000
+    with pytest.raises(WeightsError, match="for cnn, not for yolo"):
+        load_weights(tmp_path / "a.onnx", "yolo")
+    with pytest.raises(WeightsError, match="--mapper forward"):
+        load_weights(tmp_path / "a.onnx", "cnn", "det")
+
+
+def tiny(path: Path, card: Card | str) -> None:
+    """A network that gives back what it gets, with a card, or with any text in its place."""
+    onnx = pytest.importorskip("onnx", reason="needs the extra [train]")
+    from onnx import TensorProto, helper
+
+    ends = [helper.make_tensor_value_info(name, TensorProto.FLOAT, ["n"]) for name in ("a", "b")]
+    graph = helper.make_graph([helper.make_node("Identity", ["a"], ["b"])], "tiny", ends[:1], ends[1:])
+    model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=8)
+    model.metadata_props.add(key="prim", value=card if isinstance(card, str) else card.to_json())
+    onnx.save(model, str(path))
+
+
+YOLO, CNN = Card("yolo", "det"), Card("cnn", "det", preset="prim", channels=1)
+
+
+def test_a_folder_of_weights(tmp_path: Path) -> None:
+    tiny(tmp_path / "yolo.onnx", YOLO)
+    tiny(tmp_path / "cnn.onnx", CNN)
+    for path in (tmp_path, tmp_path / "yolo.onnx"):
+        yolo, networks = load_set(path, "det")
+        assert yolo.card == YOLO and [network.card for network in networks] == [CNN]
+
+
+@pytest.mark.parametrize(
+    ("others", "said"),
+    [
+        ([], "no network that reads the parameters of: circle, ellipse, rectangle, square, triangle"),
+        ([replace(CNN, kinds=("square", "circle"))], "no network that reads the parameters of: ellipse, rectangle"),
+        ([CNN, replace(CNN, kinds=("square",))], "several networks for: square"),
+        ([replace(CNN, mapper="prob")], "reads the maps of prob, not of det"),
+        ([replace(CNN, style="rounded")], "reads other images"),
+        ([replace(CNN, resolution=0.05)], "reads other images"),
+        ([YOLO], "a network for yolo, not for cnn"),
+    ],
+)
+def test_folders_that_do_not_fit(tmp_path: Path, others: list[Card], said: str) -> None:
+    tiny(tmp_path / "yolo.onnx", YOLO)
+    for number, card in enumerate(others):
+        tiny(tmp_path / f"cnn.{number}.onnx", card)
+    with pytest.raises(WeightsError, match=said):
+        load_set(tmp_path, "det")
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"stage": "magic"},
+        {"kinds": [["square"]]},
+        {"kinds": ["hexagon"]},
+        {"style": "loud"},
+        {"channels": "a"},
+        {"resolution": "x"},
+        {"resolution": 0.0},
+        {"thresholds": [1]},
+        {"thresholds": {"square": 7.0}},
+        {"mapper": 3},
+    ],
+)
+def test_cards_that_say_what_none_of_ours_says(tmp_path: Path, change: dict[str, object]) -> None:
+    tiny(tmp_path / "a.onnx", json.dumps(json.loads(YOLO.to_json()) | change))
+    with pytest.raises(WeightsError, match="has no model card"):
+        load_weights(tmp_path / "a.onnx", "yolo")
+
+
+def test_what_is_no_checkpoint_is_not_exported(tmp_path: Path) -> None:
+    pytest.importorskip("torch", reason="needs the extra [train]")
+    from detect.training.export import export_cnn, export_yolo
+    from prim.errors import UsageError
+
+    path = tmp_path / "a.pt"
+    path.write_bytes(pickle.dumps(print))
+    with pytest.raises(UsageError, match="no checkpoint"):
+        export_cnn(path, "det", tmp_path / "a.onnx")
+    with pytest.raises(UsageError, match="--trust"):
+        export_yolo(path, "det", tmp_path / "a.onnx", trust=False)
+
+
+def test_an_exported_network_can_be_trained_on(tmp_path: Path) -> None:
+    """Reopened, with normalisations put back, it gives the same numbers; nothing in the file is run."""
+    torch = pytest.importorskip("torch", reason="needs the extra [train]")
+    pytest.importorskip("ultralytics", reason="needs the extra [train]")
+    from detect.networks.parameters import PRIM
+    from detect.networks.weights import SHIPPED
+    from detect.training.export import reopen_cnn, reopen_yolo
+    from detect.training.model import ParameterNetwork
+    from prim.errors import UsageError
+    from prim.shapes import Kind
+
+    torch.manual_seed(0)
+    yolo, (cnn,) = load_set(SHIPPED / "forward")
+    images = torch.rand(4, 3, 96, 96)
+    opened = torch.load(reopen_yolo(yolo.path, images, tmp_path / "a.pt"), weights_only=False)["model"].float()
+    with torch.no_grad():
+        again = opened.eval()(images)[0].numpy()
+    before = yolo.session.run(None, {"images": images.numpy()})[0]
+    assert again == pytest.approx(before, abs=2e-3)
+    seen = opened.train()(images)  # normalisations that fit what they see: training begins where it was left
+    assert all(torch.isfinite(part).all() for part in seen.values() if isinstance(part, torch.Tensor))
+
+    network, crops = ParameterNetwork(list(Kind), PRIM), torch.rand(4, 1, 72, 72)
+    reopen_cnn(cnn.path, network, crops)
+    with torch.no_grad():
+        outputs = network.eval()(crops).numpy()
+    assert outputs == pytest.approx(cnn.session.run(None, {"crops": crops.numpy()})[0], abs=1e-4)
+
+    with pytest.raises(UsageError, match="no YOLOv5n"):
+        reopen_yolo(cnn.path, images, tmp_path / "b.pt")
+    with pytest.raises(UsageError, match="no network of this preset"):
+        reopen_cnn(yolo.path, network, crops)
+    (tmp_path / "junk.onnx").write_bytes(b"junk")
+    with pytest.raises(UsageError, match="no ONNX network"):
+        reopen_cnn(tmp_path / "junk.onnx", network, crops)

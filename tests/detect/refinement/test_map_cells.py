@@ -1,0 +1,69 @@
+"""Cells of a map, told apart."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy import ndimage
+
+from detect.refinement.lines import middle_line, off_line
+from detect.refinement.map_cells import MapCells
+from mapping.grid import GridFrame, OccupancyGrid
+from mapping.morphology import number_connected
+from tests.detect.refinement.rooms import mapped, room, scans
+
+
+@given(seed=st.integers(0, 10_000), share=st.floats(0, 0.6), most=st.integers(1, 40))
+@settings(max_examples=50, deadline=None)
+def test_what_hangs_together_is_numbered_as_scipy_does(seed: int, share: float, most: int) -> None:
+    rng = np.random.default_rng(seed)
+    occupied = rng.random(rng.integers(1, 60, 2)) < share
+    labels, large = np.zeros(occupied.shape, np.int32), np.zeros_like(occupied)
+    number_connected(occupied, float(most), labels, large)
+    expected, _ = ndimage.label(occupied, np.ones((3, 3)))
+    assert (labels == expected).all()
+    spans = [max(part.stop - part.start for part in parts) for parts in ndimage.find_objects(expected)]
+    assert (large == np.isin(expected, [k for k, span in enumerate(spans, start=1) if span > most])).all()
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_walls_that_noise_bends_are_walls(seed: int) -> None:
+    """From one end to the other, where the room's are, to within what the map tells; nothing is free behind them."""
+    cells = MapCells.of(mapped(scans(room(), 0.5, stops=6, seed=seed)))
+    assert len(cells.walls) == 4
+    for wall in cells.walls:
+        nx, ny, d = wall.line
+        assert max(abs(nx), abs(ny)) > 0.998 and d == pytest.approx(-1.0, abs=0.04)
+        assert wall.last - wall.first > 1.8
+
+
+def test_a_sharp_wall_stays_where_it_is_beside_what_stands_on_it() -> None:
+    along = np.arange(0.0, 2.0, 0.01)
+    wall = np.column_stack((along, 0.3 + 0.1 * along))
+    beside = wall[60:110] + np.array([0.0, 0.025])
+    line = middle_line(np.concatenate((wall, beside)), 0.01)
+    assert off_line(wall, line).max() < 0.001
+
+
+def test_specks_are_no_walls() -> None:
+    """However many of them lie along a line by chance."""
+    specks = np.random.default_rng(0).random((220, 220)) < 0.06
+    grid = OccupancyGrid(GridFrame(0.01, -110, -110, 220, 220), np.where(specks, 0.9, 0.1).astype(np.float32))
+    assert not MapCells.of(grid).large.any()
+
+
+@pytest.mark.parametrize("upright", [False, True])
+@pytest.mark.parametrize(("length", "kept", "gap"), [(200, 0.55, 1), (120, 1.0, 40)], ids=["worn", "in pieces"])
+def test_walls_have_holes(length: int, kept: float, gap: int, upright: bool) -> None:
+    """A sharp wall, of whose cells no more than 0.4 m hang together: what is left of it is a wall."""
+    wall = np.zeros((220, 220), np.bool_)
+    wall[10, 10 : 10 + length] = np.random.default_rng(1).random(length) < kept
+    wall[10, ::gap] &= gap == 1
+    cells = np.where(wall, 0.9, 0.1).astype(np.float32)
+    cells[:10] = 0.5
+    if upright:
+        cells, wall = cells.T.copy(), wall.T
+    found = MapCells.of(OccupancyGrid(GridFrame(0.01, -110, -110, 220, 220), cells))
+    assert (found.large == wall).all() and len(found.walls) == 1
