@@ -45,7 +45,7 @@ JITTER, PLACES = 0.001, 8
 
 @dataclass(frozen=True)
 class Limits:
-    """Both bounds (K,) of one primitive's own parameters (m, rad, in the order of detect.refinement.fit.NAMES)."""
+    """Both bounds (K,) of one primitive's own parameters (m, rad, in the order of Kind.parameters)."""
 
     chapman_robbins: FloatArray
     weiss_weinstein: FloatArray

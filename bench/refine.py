@@ -31,7 +31,6 @@ from detect.detector import Detector
 from detect.evaluation.box_metrics import Marked, score_boxes
 from detect.evaluation.sessions import marked
 from detect.networks.weights import SHIPPED
-from detect.refinement.fit import NAMES
 from detect.refinement.map_cells import is_within
 from detect.refinement.refine import refine_detections
 from mapping.mapper import make_mapper
@@ -105,7 +104,7 @@ def outcome(seed: int, noise_std: float, mapper: str) -> Outcome:
             seen = pair is not None and pair.iou >= 0.5
             rows.append(Found(true.kind, seen, False, False, opencv=opencv))
             continue
-        one, names = primitives[pair.detection], NAMES[true.kind]
+        one, names = primitives[pair.detection], true.kind.parameters
         rows.append(
             Found(
                 true.kind,
@@ -232,15 +231,12 @@ def limits_table(noise_std: float, of: Sequence[Outcome]) -> list[str]:
         found = [row for one in of for row in one.primitives if row.found and row.kind is kind]
         cells = []
         for name in ("x", "y", "theta", "size", "size 2"):
-            names = [*NAMES[kind][:2], *(["theta"] if "theta" in NAMES[kind] else [None]), *NAMES[kind][-2:]]
-            own = [n for n in NAMES[kind] if n not in ("x", "y", "theta")]
-            key = {"size": own[0], "size 2": own[1] if len(own) > 1 else None}.get(
-                name, name if name in names else None
-            )
-            if key is None or key not in NAMES[kind]:
+            sizes = {"size": kind.sizes[0], "size 2": kind.sizes[-1] if len(kind.sizes) > 1 else None}
+            key = sizes.get(name, name)
+            if key not in kind.parameters:
                 cells.append("")
                 continue
-            at = NAMES[kind].index(key)
+            at = kind.parameters.index(key)
             errors = [row.errors[at] for row in found]
             factors = (ratio(errors, [getattr(row, name)[at] for row in found]) for name in ("limits", "unbiased"))
             cells.append(" / ".join(f"{factor:.2f}" for factor in factors))

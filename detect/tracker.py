@@ -24,7 +24,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from prim.arrays import FloatArray
-from prim.shapes import SIZE_KEYS, Kind, Primitive, angle_difference
+from prim.shapes import Kind, Primitive, angle_difference
 
 if TYPE_CHECKING:
     from detect.detection import Detection
@@ -88,15 +88,14 @@ class _Hypothesis:
     def primitive(self) -> Primitive:
         """The state as a primitive."""
         values = self.state.tolist()
-        theta = None if self.kind is Kind.CIRCLE else values[2]
-        sizes = values[len(values) - len(SIZE_KEYS[self.kind]) :]
+        theta = values[2] if self.kind.has_angle else None
+        sizes = values[len(values) - len(self.kind.sizes) :]
         return Primitive(self.kind, values[0], values[1], theta, tuple(max(v, 1e-3) for v in sizes)).canonical()
 
     @property
     def std(self) -> dict[str, float]:
         """Standard deviations (m, rad) by name."""
-        names = ["x", "y", *([] if self.kind is Kind.CIRCLE else ["theta"]), *SIZE_KEYS[self.kind]]
-        return dict(zip(names, np.sqrt(self.variance).tolist(), strict=True))
+        return dict(zip(self.kind.parameters, np.sqrt(self.variance).tolist(), strict=True))
 
 
 @dataclass

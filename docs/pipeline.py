@@ -18,18 +18,11 @@ from detect.detection import Detection
 from detect.detector import Detector
 from mapping.grid import OccupancyGrid
 from mapping.mapper import make_mapper
-from prim.shapes import Kind, Primitive
+from prim.shapes import Primitive
 
 NOISE = {0.0: "n = 0", 0.05: "n = 0.05", 0.075: "n = 0.075", 0.1: "n = 0.1"}
 MAPPERS = ("det", "prob", "forward")
 SCALE, GAP, LABEL = 2, 8, 20
-COLOURS = {
-    Kind.SQUARE: (0, 114, 178),
-    Kind.RECTANGLE: (213, 94, 0),
-    Kind.CIRCLE: (0, 158, 115),
-    Kind.TRIANGLE: (204, 121, 167),
-    Kind.ELLIPSE: (230, 159, 0),
-}
 TRUTH = (140, 140, 140)
 SEED = 40_002
 
@@ -55,7 +48,7 @@ def draw(grid: OccupancyGrid, found: tuple[Detection, ...], truth: tuple[Primiti
         for a, b in zip(ring, [*ring[1:], ring[0]], strict=True):
             pen.line((a, b), fill=TRUTH, width=1)
     for one in found:
-        ring, colour = corners(one.primitive), COLOURS[one.primitive.kind]
+        ring, colour = corners(one.primitive), one.primitive.kind.row.color
         pen.line([*ring, ring[0]], fill=colour, width=2)
         x, y = min(x for x, _ in ring), min(y for _, y in ring)
         pen.text((x, y - 12), f"{one.primitive.kind} {one.score:.2f}", fill=colour)

@@ -1,4 +1,4 @@
-"""The five geometric primitives: parameters, outline, canonical form, symmetric angle differences.
+"""The geometric primitives: one table of kinds, and what follows from it.
 
 Lengths are metres, angles radians, counter-clockwise. ``(x, y)`` is the area centroid in the map frame.
 
@@ -13,15 +13,19 @@ ellipse     semi_major >= semi_minor       [0, pi), direction of the major axis
 ==========  =============================  ==========================================
 
 Nothing here is a half size but the radius and the semi-axes: side, width, height and base are full lengths.
+
+All that a kind is stands in its row of :class:`Kind`; nothing elsewhere asks for a kind by its name. A shape is its
+kind's unit outline stretched by width and height, turned by theta and moved to its centroid.
 """
 
 from __future__ import annotations
 
 import json
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from enum import StrEnum
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -35,32 +39,163 @@ SIDES_AGREE = 0.03
 OUTLINE_POINTS = 128
 """Vertices that stand for a curved outline; the polygon's area is then 0.04 % short of the shape's."""
 
+Color = tuple[int, int, int]
+Polygon = tuple[tuple[float, float], ...]
+Draw = Callable[[np.random.Generator], tuple[float, ...]]
+
+
+def uniform(sizes: int, low: float, high: float) -> Draw:
+    """So many sizes (m) drawn independently, each uniform from ``low`` to ``high``."""
+    return lambda rng: tuple(rng.uniform(low, high) for _ in range(sizes))
+
+
+def isosceles(low: float, high: float, least_height: float) -> Draw:
+    """Base and height (m) of an isosceles triangle: base and legs uniform, drawn again until it is high enough."""
+
+    def draw(rng: np.random.Generator) -> tuple[float, float]:
+        while True:
+            base, leg = rng.uniform(low, high), rng.uniform(low, high)
+            if leg > base / 2 and (height := math.sqrt(leg**2 - base**2 / 4)) >= least_height:
+                return base, height
+
+    return draw
+
+
+TURN = 2 * math.pi
+
+SKY_BLUE, GREEN, ORANGE = (86, 180, 233), (0, 158, 115), (230, 159, 0)
+VERMILION, PURPLE = (213, 94, 0), (204, 121, 167)
+"""Colours (red, green, blue) of Okabe and Ito's palette, for all kinds of colour vision."""
+
+DISC: Polygon = ()
+"""The unit disc, in the place of a polygon."""
+
+BOX: Polygon = ((-1 / 2, -1 / 2), (1 / 2, -1 / 2), (1 / 2, 1 / 2), (-1 / 2, 1 / 2))
+TRIANGLE: Polygon = ((-1 / 2, -1 / 3), (1 / 2, -1 / 3), (0.0, 2 / 3))
+
+
+@dataclass(frozen=True)
+class Row:
+    """What a kind is.
+
+    Attributes:
+        sizes: the sizes' names, in the order of :attr:`Primitive.size`. A single one is tied: it is both the width
+            and the height that the unit outline is stretched by.
+        outline: the unit outline, counter-clockwise about its centroid: a convex polygon, or DISC.
+        period: the turn (rad) after which theta is the same again; None where the kind has no angle.
+        regular_period: the same where the outline's sides (a disc's axes) agree within SIDES_AGREE.
+        draw: draws sizes (m) as the recorder wants them: the paper's ranges.
+        color: red, green, blue (0 to 255).
+
+    """
+
+    sizes: tuple[str, ...]
+    outline: Polygon
+    period: float | None
+    regular_period: float | None
+    draw: Draw
+    color: Color
+
 
 class Kind(StrEnum):
-    """A kind of primitive, in the paper's order."""
+    """A kind of primitive, in the paper's order: the table of kinds."""
 
-    SQUARE = "square"
-    RECTANGLE = "rectangle"
-    CIRCLE = "circle"
-    TRIANGLE = "triangle"
-    ELLIPSE = "ellipse"
+    row: Row
+
+    def __new__(cls, name: str, row: Row | None = None) -> Kind:
+        """A member whose value is its name; ``Kind("circle")`` gives the member of that name."""
+        assert row is not None
+        member = str.__new__(cls, name)
+        member._value_, member.row = name, row
+        return member
+
+    SQUARE = "square", Row(("side",), BOX, TURN / 4, TURN / 4, uniform(1, 0.08, 0.3), SKY_BLUE)
+    RECTANGLE = "rectangle", Row(("width", "height"), BOX, TURN / 2, TURN / 4, uniform(2, 0.06, 0.32), GREEN)
+    CIRCLE = "circle", Row(("radius",), DISC, None, None, uniform(1, 0.05, 0.3), ORANGE)
+    TRIANGLE = "triangle", Row(("base", "height"), TRIANGLE, TURN, TURN / 3, isosceles(0.1, 0.3, 0.06), VERMILION)
+    ELLIPSE = "ellipse", Row(("semi_major", "semi_minor"), DISC, TURN / 2, None, uniform(2, 0.02, 0.16), PURPLE)
+
+    @property
+    def sizes(self) -> tuple[str, ...]:
+        """The sizes' names."""
+        return self.row.sizes
+
+    @property
+    def has_angle(self) -> bool:
+        """Whether a turn changes anything."""
+        return self.row.period is not None
+
+    @cached_property
+    def parameters(self) -> tuple[str, ...]:
+        """The names of a kind's own parameters: x, y, theta where it has one, sizes."""
+        return ("x", "y", *(("theta",) if self.has_angle else ()), *self.sizes)
+
+    @property
+    def is_tied(self) -> bool:
+        """Whether width and height are one and the same size."""
+        return len(self.sizes) == 1
+
+    @property
+    def is_round(self) -> bool:
+        """Whether the outline is an ellipse or a circle, and no polygon."""
+        return self.row.outline == DISC
+
+    @property
+    def corners(self) -> int:
+        """How many corners the outline has; none where it is round."""
+        return len(self.row.outline)
+
+    @cached_property
+    def longer_first(self) -> bool:
+        """Whether both sizes exchanged make the same shape, turned by a quarter: the longer one is then first."""
+        turned = [(-y, x) for x, y in self.row.outline]
+        return not self.is_tied and {_rounded(vertex) for vertex in turned} == {*map(_rounded, self.row.outline)}
+
+    @cached_property
+    def special_case(self) -> Kind | None:
+        """The kind with the same outline whose sizes are tied: what this one is where its sizes agree."""
+        alike = (kind for kind in Kind if kind.is_tied and not self.is_tied and kind.row.outline == self.row.outline)
+        return next(alike, None)
+
+    @cached_property
+    def vertices(self) -> FloatArray:
+        """The unit outline's vertices (N, 2), counter-clockwise; of the disc (OUTLINE_POINTS, 2) on it."""
+        return _round_vertices(OUTLINE_POINTS) if self.is_round else np.array(self.row.outline)
+
+    @cached_property
+    def extent(self) -> float:
+        """The larger of the unit outline's extents along x and y: how long a shape of size 1 is."""
+        return 2.0 if self.is_round else float(np.ptp(self.vertices, axis=0).max())
+
+    @cached_property
+    def unit_area(self) -> float:
+        """The unit outline's area."""
+        return math.pi if self.is_round else round(_moments(self.vertices)[0], 12)
+
+    @cached_property
+    def unit_variances(self) -> tuple[float, float]:
+        """The variances of the unit outline's area along x and y."""
+        if self.is_round:
+            return 0.25, 0.25
+        area, along_x, along_y = _moments(self.vertices)
+        return along_x / area, along_y / area
 
 
-SIZE_KEYS: Mapping[Kind, tuple[str, ...]] = {
-    Kind.SQUARE: ("side",),
-    Kind.RECTANGLE: ("width", "height"),
-    Kind.CIRCLE: ("radius",),
-    Kind.TRIANGLE: ("base", "height"),
-    Kind.ELLIPSE: ("semi_major", "semi_minor"),
-}
-"""Names of each kind's sizes, in the order of :attr:`Primitive.size`."""
+def _rounded(vertex: tuple[float, float]) -> tuple[float, float]:
+    return round(vertex[0], 9), round(vertex[1], 9)
 
-_SYMMETRY: Mapping[Kind, float] = {
-    Kind.SQUARE: math.pi / 2,
-    Kind.RECTANGLE: math.pi,
-    Kind.TRIANGLE: 2 * math.pi,
-    Kind.ELLIPSE: math.pi,
-}
+
+def _round_vertices(points: int) -> FloatArray:
+    turn = np.linspace(0, 2 * np.pi, points, endpoint=False)
+    return np.column_stack((np.cos(turn), np.sin(turn)))
+
+
+def _moments(vertices: FloatArray) -> tuple[float, float, float]:
+    """Area and second moments of area along x and y about the origin of a polygon (Green's theorem)."""
+    (x, y), (next_x, next_y) = vertices.T, np.roll(vertices, -1, axis=0).T
+    cross = x * next_y - next_x * y
+    along_x, along_y = (cross * (a * a + a * b + b * b) for a, b in ((x, next_x), (y, next_y)))
+    return float(cross.sum() / 2), float(along_x.sum() / 12), float(along_y.sum() / 12)
 
 
 @dataclass(frozen=True, slots=True)
@@ -77,11 +212,12 @@ class Primitive:
     size: tuple[float, ...]
 
     def __post_init__(self) -> None:
-        keys = SIZE_KEYS[self.kind]
+        keys = self.kind.sizes
         if len(self.size) != len(keys):
             raise ValueError(f"a {self.kind} has {len(keys)} sizes ({', '.join(keys)}), not {len(self.size)}")
-        if (self.theta is None) != (self.kind is Kind.CIRCLE):
-            raise ValueError(f"theta of a {self.kind} is {self.theta}: a circle has none, all others have one")
+        if (self.theta is not None) != self.kind.has_angle:
+            has = "has one" if self.kind.has_angle else "has none"
+            raise ValueError(f"theta of a {self.kind} is {self.theta}: a {self.kind} {has}")
         if not all(math.isfinite(v) for v in (self.x, self.y, self.theta or 0.0, *self.size)):
             raise ValueError(f"a {self.kind} has a value that is not finite: {self}")
         if min(self.size) <= 0:
@@ -90,11 +226,11 @@ class Primitive:
     @property
     def sizes(self) -> dict[str, float]:
         """The sizes by name (m), as logs and reports hold them."""
-        return dict(zip(SIZE_KEYS[self.kind], self.size, strict=True))
+        return dict(zip(self.kind.sizes, self.size, strict=True))
 
     @property
     def width_height(self) -> tuple[float, float]:
-        """Width and height in the sense of the paper's Table II (m).
+        """Width and height in the sense of the paper's Table II (m): what the unit outline is stretched by.
 
         Base and height of a triangle, semi-major and semi-minor axis of an ellipse, the radius on both for a
         circle, the side on both for a square.
@@ -105,8 +241,26 @@ class Primitive:
     def area(self) -> float:
         """Area (m^2)."""
         width, height = self.width_height
-        factor = {Kind.CIRCLE: math.pi, Kind.ELLIPSE: math.pi, Kind.TRIANGLE: 0.5}.get(self.kind, 1.0)
-        return factor * width * height
+        return self.kind.unit_area * width * height
+
+    @property
+    def circumradius(self) -> float:
+        """How far (m) the outline reaches from the centroid."""
+        if self.is_round:
+            return max(self.width_height)
+        return float(np.hypot(*self.local_outline().T).max())
+
+    @property
+    def sides(self) -> tuple[float, ...]:
+        """The lengths (m) of the outline's edges; of a round shape both semi-axes."""
+        if self.is_round:
+            return self.width_height
+        corners = self.local_outline()
+        return tuple(np.hypot(*(np.roll(corners, -1, axis=0) - corners).T).tolist())
+
+    def sides_agree(self, share: float) -> bool:
+        """Whether all sides are the same to within a share of the longest one."""
+        return max(self.sides) - min(self.sides) <= share * max(self.sides)
 
     @property
     def symmetry(self) -> float | None:
@@ -115,38 +269,23 @@ class Primitive:
         Where the sides agree within 3 %, the shape counts as its more symmetric relative: a rectangle as a
         square, a triangle as equilateral, an ellipse as a circle.
         """
-        if self.kind is Kind.CIRCLE:
-            return None
-        if self.kind is Kind.SQUARE or not self._sides_agree():
-            return _SYMMETRY[self.kind]
-        return {Kind.RECTANGLE: math.pi / 2, Kind.TRIANGLE: 2 * math.pi / 3}.get(self.kind)
-
-    def _sides_agree(self) -> bool:
-        first, second = self.size
-        if self.kind is Kind.TRIANGLE:
-            second = math.hypot(first / 2, second)
-        return abs(first - second) <= SIDES_AGREE * max(first, second)
+        return self.kind.row.regular_period if self.sides_agree(SIDES_AGREE) else self.kind.row.period
 
     def canonical(self) -> Primitive:
         """The same shape with the longer side first (rectangle, ellipse) and theta in its kind's range."""
-        if self.theta is None:
+        period = self.kind.row.period
+        if self.theta is None or period is None:
             return self
         theta, size = self.theta, self.size
-        if self.kind in (Kind.RECTANGLE, Kind.ELLIPSE) and size[0] < size[1]:
+        if self.kind.longer_first and size[0] < size[1]:
             theta, size = theta + math.pi / 2, (size[1], size[0])
-        period = _SYMMETRY[self.kind]
         theta = theta % period
         return replace(self, theta=0.0 if theta >= period else theta, size=size)
 
     def local_outline(self, points: int = OUTLINE_POINTS) -> FloatArray:
         """Counter-clockwise vertices in the shape's own frame, (N, 2) in metres, the first not repeated."""
-        width, height = self.width_height
-        if self.is_round:
-            turn = np.linspace(0, 2 * np.pi, points, endpoint=False)
-            return np.column_stack((width * np.cos(turn), height * np.sin(turn)))
-        if self.kind is Kind.TRIANGLE:
-            return np.array([[-width / 2, -height / 3], [width / 2, -height / 3], [0.0, 2 * height / 3]])
-        return np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) * (width / 2, height / 2)
+        vertices = _round_vertices(points) if self.is_round else self.kind.vertices
+        return np.asarray(vertices * self.width_height)
 
     def outline(self, points: int = OUTLINE_POINTS) -> FloatArray:
         """Counter-clockwise vertices in the map frame, (N, 2) in metres, the first not repeated."""
@@ -158,7 +297,7 @@ class Primitive:
     @property
     def is_round(self) -> bool:
         """Whether the outline is an ellipse or a circle, and no polygon."""
-        return self.kind in (Kind.CIRCLE, Kind.ELLIPSE)
+        return self.kind.is_round
 
     def cast(self, origin: tuple[float, float], directions: FloatArray) -> FloatArray:
         """Exact distances (m) from ``origin`` along unit ``directions`` (N, 2), map frame; inf for a miss.
@@ -190,11 +329,11 @@ class Primitive:
         try:
             kind = Kind(value["kind"])
             size = value["size"]
-            unknown = set(size) - set(SIZE_KEYS[kind])
+            unknown = set(size) - set(kind.sizes)
             if unknown:
                 raise ValueError(f"a {kind} has no size {sorted(unknown)[0]!r}")
-            theta = None if kind is Kind.CIRCLE else float(value["theta"])
-            lengths = tuple(float(size[key]) for key in SIZE_KEYS[kind])
+            theta = float(value["theta"]) if kind.has_angle else None
+            lengths = tuple(float(size[key]) for key in kind.sizes)
             return cls(kind, float(value["x"]), float(value["y"]), theta, lengths)
         except KeyError as missing:
             raise ValueError(f"{missing.args[0]!r} is missing in {json.dumps(value)}") from None

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 PAPER_NOISE_UNIT = 5.0
 """``--noise 1`` is a standard deviation of this many metres (the paper's IV-A)."""
 
-KINDS = "square,rectangle,circle,triangle,ellipse"
+KINDS = "all"
 
 
 class MotionName(StrEnum):
@@ -48,7 +48,7 @@ def record(
     world: Annotated[Path | None, typer.Option(help="Read the world from this JSON file.")] = None,
     size: Annotated[tuple[float, float], typer.Option(metavar="X Y", help="The floor, metres.")] = (2.0, 2.0),
     walls: Annotated[bool, typer.Option(help="A wall along each edge of the floor.")] = True,
-    kinds: Annotated[str, typer.Option(help="Kinds of primitives to draw, with commas.")] = KINDS,
+    kinds: Annotated[str, typer.Option(help="Kinds of primitives to draw, with commas, or all.")] = KINDS,
     per_kind: Annotated[
         str, typer.Option(metavar="N or A-B", help="How many of each kind: a number or a range.")
     ] = "0-2",
@@ -143,11 +143,11 @@ def _fov_radians(degrees: float) -> float:
 def _kinds(text: str) -> tuple[Kind, ...]:
     from prim.shapes import Kind
 
-    names = [name.strip() for name in text.split(",") if name.strip()]
-    unknown = [name for name in names if name not in KINDS.split(",")]
+    names = [*Kind] if text == KINDS else [name.strip() for name in text.split(",") if name.strip()]
+    unknown = [name for name in names if name not in [*Kind]]
     if unknown or not names:
         what = f"{', '.join(unknown)} is no kind" if unknown else "it names no kind"
-        raise UsageError(f"--kinds {text}: {what}; the kinds are {KINDS}")
+        raise UsageError(f"--kinds {text}: {what}; the kinds are {','.join(Kind)}")
     return tuple(Kind(name) for name in names)
 
 

@@ -13,7 +13,7 @@ from dataclasses import replace
 import pymunk
 
 from prim.se2 import Pose2D
-from prim.shapes import Kind, Primitive
+from prim.shapes import Primitive
 from prim.world import World
 
 ROBOT_RADIUS = 0.035
@@ -138,7 +138,7 @@ def _stands_still(shape: pymunk.Shape | None) -> bool:
 
 def _moved(primitive: Primitive, body: pymunk.Body) -> Primitive:
     """The primitive where its body is now; itself if that is where it was."""
-    turned = math.remainder(body.angle - (primitive.theta or 0.0), primitive_turn(primitive))
+    turned = math.remainder(body.angle - (primitive.theta or 0.0), primitive.kind.row.period or math.inf)
     still = math.hypot(body.position.x - primitive.x, body.position.y - primitive.y) < MOVED_METRES
     if still and (primitive.theta is None or abs(turned) < MOVED_RADIANS):
         return primitive
@@ -146,12 +146,7 @@ def _moved(primitive: Primitive, body: pymunk.Body) -> Primitive:
     return replace(primitive, x=body.position.x, y=body.position.y, theta=theta).canonical()
 
 
-def primitive_turn(primitive: Primitive) -> float:
-    """The turn (rad) after which a kind's theta is the same again, by its definition."""
-    return {Kind.SQUARE: math.pi / 2, Kind.TRIANGLE: 2 * math.pi}.get(primitive.kind, math.pi)
-
-
 def _shape(primitive: Primitive, body: pymunk.Body) -> pymunk.Shape:
-    if primitive.kind is Kind.CIRCLE:
-        return pymunk.Circle(body, primitive.size[0])
+    if not primitive.kind.has_angle:
+        return pymunk.Circle(body, primitive.circumradius)
     return pymunk.Poly(body, primitive.local_outline(_OUTLINE_POINTS).tolist())

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import islice
 
@@ -19,7 +19,6 @@ GAP = 0.03
 
 _TRIES_PER_PRIMITIVE = 200
 _TRIES = 20_000
-_MIN_TRIANGLE_HEIGHT = 0.06
 
 
 @dataclass(frozen=True)
@@ -72,23 +71,7 @@ def _place(
 
 def draw_primitive(rng: np.random.Generator, kind: Kind, size: tuple[float, float]) -> Primitive:
     """One primitive of random size, heading and place (its size within the paper's ranges)."""
-    lengths = _DRAW_SIZE[kind](rng)
-    theta = None if kind is Kind.CIRCLE else rng.uniform(0, 2 * math.pi)
+    lengths = kind.row.draw(rng)
+    theta = rng.uniform(0, 2 * math.pi) if kind.has_angle else None
     x, y = (rng.uniform(-length / 2, length / 2) for length in size)
     return Primitive(kind, x, y, theta, lengths).canonical()
-
-
-def _draw_triangle(rng: np.random.Generator) -> tuple[float, float]:
-    while True:
-        base, leg = rng.uniform(0.1, 0.3), rng.uniform(0.1, 0.3)
-        if leg > base / 2 and (height := math.sqrt(leg**2 - base**2 / 4)) >= _MIN_TRIANGLE_HEIGHT:
-            return base, height
-
-
-_DRAW_SIZE: Mapping[Kind, Callable[[np.random.Generator], tuple[float, ...]]] = {
-    Kind.SQUARE: lambda rng: (rng.uniform(0.08, 0.3),),
-    Kind.RECTANGLE: lambda rng: (rng.uniform(0.06, 0.32), rng.uniform(0.06, 0.32)),
-    Kind.CIRCLE: lambda rng: (rng.uniform(0.05, 0.3),),
-    Kind.TRIANGLE: _draw_triangle,
-    Kind.ELLIPSE: lambda rng: (rng.uniform(0.02, 0.16), rng.uniform(0.02, 0.16)),
-}

@@ -23,7 +23,7 @@ from prim.arrays import FloatArray
 from prim.errors import OutputError, PrimError, UsageError
 from prim.metrics import DetectionErrors
 from prim.se2 import Pose2D
-from prim.shapes import Kind, Primitive
+from prim.shapes import Primitive
 from prim.world import World
 from replay.detection import Sighting
 from replay.report import table
@@ -73,14 +73,6 @@ SCORES = {
     "auc": ("AUC", (204, 121, 167)),
 }
 """The map's scores over time: name and colour of each line."""
-
-KIND_COLORS: dict[Kind, Color] = {
-    Kind.SQUARE: (0, 114, 178),
-    Kind.RECTANGLE: (213, 94, 0),
-    Kind.CIRCLE: (0, 158, 115),
-    Kind.TRIANGLE: (204, 60, 150),
-    Kind.ELLIPSE: (200, 130, 0),
-}
 
 BAND_ALPHA = 130
 """How opaque the outlines of one standard deviation are."""
@@ -213,7 +205,7 @@ class RerunViewer:
         rings = [np.vstack((ring := one.primitive.outline(64), ring[:1])) for one in found]
         return rr.LineStrips3D(
             [self._lifted(ring, FOUND_LIFT) for ring in rings],
-            colors=[KIND_COLORS[one.primitive.kind] for one in found],
+            colors=[one.primitive.kind.row.color for one in found],
             radii=rr.Radius.ui_points(2.0),
         )
 
@@ -223,7 +215,7 @@ class RerunViewer:
         rings = [np.vstack((ring := edge.outline(64), ring[:1])) for _, edge in edges]
         return rr.LineStrips3D(
             [self._lifted(ring, FOUND_LIFT) for ring in rings],
-            colors=[(*KIND_COLORS[kind], BAND_ALPHA) for kind, _ in edges],
+            colors=[(*kind.row.color, BAND_ALPHA) for kind, _ in edges],
             radii=rr.Radius.ui_points(0.8),
         )
 

@@ -33,6 +33,9 @@ MOST = 300
 
 BATCH = 8
 
+CLEARLY_UNLIKE = 0.1
+"""Sides that differ by this share of the longest: the shape looks another when it is turned."""
+
 Result = TypeVar("Result")
 Progress = Callable[[int, int], None]
 
@@ -197,7 +200,7 @@ def errors_of(pairs: Sequence[tuple[Primitive, Primitive]]) -> dict[str, Errors]
     if not pairs:
         return {}
     rows = {kind.value: [pair for pair in pairs if pair[1].kind is kind] for kind in Kind}
-    angular = [pair for pair in pairs if pair[1].kind is not Kind.CIRCLE]
+    angular = [pair for pair in pairs if pair[1].kind.has_angle]
     each = {name: _mean_errors(own, own) for name, own in rows.items() if own}
     return {"all": _mean_errors(pairs, angular)} | each
 
@@ -223,12 +226,8 @@ def _mean_errors(
 
 def _is_clear(primitive: Primitive) -> bool:
     """Whether a shape looks another when it is turned within its kind's symmetry: its sides differ by a tenth."""
-    if primitive.kind is Kind.SQUARE:
-        return True
-    sides = primitive.width_height
-    if primitive.kind is Kind.TRIANGLE:
-        sides = sides[0], math.hypot(sides[0] / 2, sides[1])
-    return min(sides) <= 0.9 * max(sides)
+    row = primitive.kind.row
+    return row.period == row.regular_period or not primitive.sides_agree(CLEARLY_UNLIKE)
 
 
 def _mean(values: Iterable[float]) -> float | None:

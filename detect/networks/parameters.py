@@ -29,11 +29,16 @@ Box = tuple[float, float, float, float]
 LONGEST = 0.4
 """Sizes (m) are outputs in units of this."""
 
-TURNS = {Kind.SQUARE: 4, Kind.RECTANGLE: 2, Kind.TRIANGLE: 1, Kind.ELLIPSE: 2}
-"""How many times a kind looks the same in one turn; a circle has no angle."""
 
-SIZES = {Kind.SQUARE: 1, Kind.RECTANGLE: 2, Kind.CIRCLE: 1, Kind.TRIANGLE: 2, Kind.ELLIPSE: 2}
-"""How many sizes a kind has."""
+def repeats(kind: Kind) -> int | None:
+    """How many times a kind looks the same in one turn; None where it has no angle."""
+    period = kind.row.period
+    return None if period is None else round(2 * math.pi / period)
+
+
+def by_corners(kind: Kind, preset: Preset) -> bool:
+    """Whether a kind's angle and sizes are told by the polynomial of its corners: where it has three."""
+    return preset.vector and kind.corners == 3
 
 
 @dataclass(frozen=True)
@@ -53,15 +58,15 @@ class Preset:
 
     def angles(self, kind: Kind) -> int:
         """How many of a kind's outputs tell its angle: they come first."""
-        return 0 if kind not in TURNS else 2 if self.vector else 1
+        return 0 if not kind.has_angle else 2 if self.vector else 1
 
     def lengths(self, kind: Kind) -> int:
         """The first of a kind's outputs that are lengths; those before it are a cosine and a sine, or a share."""
-        return 0 if self.vector and kind is Kind.TRIANGLE else self.angles(kind)
+        return 0 if by_corners(kind, self) else self.angles(kind)
 
     def outputs(self, kind: Kind) -> int:
         """How many numbers tell a kind's parameters: angle, offset, sizes."""
-        return self.angles(kind) + 2 * self.offset + SIZES[kind]
+        return self.angles(kind) + 2 * self.offset + len(kind.sizes)
 
     def span(self, kinds: Sequence[Kind], kind: Kind) -> slice:
         """Which outputs of a network for several ``kinds`` are one kind's."""
@@ -139,9 +144,9 @@ def read_triangle(outputs: Sequence[float]) -> tuple[float, list[float]]:
 def targets(primitive: Primitive, preset: Preset) -> NDArray[np.float32]:
     """What a network should give for a primitive, whose place (m) is given from the middle of its crop's window."""
     values: list[float] = []
-    turns = TURNS.get(primitive.kind)
+    turns = repeats(primitive.kind)
     sizes = [size / LONGEST for size in primitive.size]
-    if preset.vector and primitive.kind is Kind.TRIANGLE:
+    if by_corners(primitive.kind, preset):
         told = [value / LONGEST for value in triangle_outputs(primitive)]
         values, sizes = told[:2], told[2:]
     elif turns is not None:
@@ -160,10 +165,10 @@ def read_outputs(kind: Kind, outputs: Sequence[float], preset: Preset, box: Box,
     for one, is not there.
     """
     first = preset.angles(kind)
-    turns = TURNS.get(kind)
+    turns = repeats(kind)
     theta = None
-    sizes = [float(value) * LONGEST for value in outputs[preset.outputs(kind) - SIZES[kind] :]]
-    if preset.vector and kind is Kind.TRIANGLE:
+    sizes = [float(value) * LONGEST for value in outputs[preset.outputs(kind) - len(kind.sizes) :]]
+    if by_corners(kind, preset):
         theta, sizes = read_triangle([*(float(value) * LONGEST for value in outputs[:2]), *sizes])
     elif turns is not None:
         period = 2 * math.pi / turns

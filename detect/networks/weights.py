@@ -146,7 +146,7 @@ def load_set(path: Path, mapper: str | None = None, threads: int | None = None) 
     twice = [kind for kind in ALL_KINDS if kinds.count(kind) > 1]
     if twice:
         raise WeightsError(f"{detector.parent} holds several networks for: {', '.join(twice)}; keep one of each")
-    missing = set(ALL_KINDS).difference(kinds)
+    missing = set(yolo.card.kinds).difference(kinds)
     if missing:
         what = ", ".join(sorted(missing))
         raise WeightsError(f"{detector.parent} holds no network that reads the parameters of: {what}")

@@ -54,15 +54,17 @@ class Boxes:
 class Yolo:
     """A network that finds primitives in tiles.
 
-    Raises WeightsError where the network does not take tiles or does not give five kinds.
+    Raises WeightsError where the network does not take tiles or does not give the kinds of its card.
     """
 
     def __init__(self, weights: Weights) -> None:
         self.weights = weights
         self._input = weights.session.get_inputs()[0].name
         shape = self._run(np.zeros((1, CHANNELS, TILE, TILE), np.float32)).shape
-        if len(shape) != 3 or shape[1] != 4 + len(KINDS):
-            raise WeightsError(f"{weights.path} gives {shape}, not boxes of {len(KINDS)} kinds: it is no detector")
+        self._kinds = np.array([KINDS.index(Kind(name)) for name in weights.card.kinds], np.intp)
+        if len(shape) != 3 or shape[1] != 4 + len(self._kinds):
+            wanted = f"boxes of {len(self._kinds)} kinds"
+            raise WeightsError(f"{weights.path} gives {shape}, not {wanted}: it is no detector")
 
     def __call__(self, images: NDArray[np.uint8], floor: float, every_kind: bool = False) -> list[Boxes]:
         """What may be in images (N, TILE, TILE, 3): candidates with a score of ``floor`` or more.
@@ -71,7 +73,7 @@ class Yolo:
         evaluation has it. Many candidates lie on each other: see :func:`suppress`.
         """
         scaled = np.ascontiguousarray(images.transpose(0, 3, 1, 2), dtype=np.float32) / np.float32(255)
-        return [_candidates(output, floor, every_kind) for output in self._run(scaled)]
+        return [_candidates(output, self._kinds, floor, every_kind) for output in self._run(scaled)]
 
     def _run(self, images: NDArray[np.float32]) -> NDArray[np.float32]:
         try:
@@ -81,8 +83,8 @@ class Yolo:
             raise WeightsError(f"{self.weights.path} does not take {wanted}: it is no detector") from error
 
 
-def _candidates(output: NDArray[np.float32], floor: float, every_kind: bool) -> Boxes:
-    """Boxes of one image from the network's output (4 + kinds, anchors): centre, size, a score per kind."""
+def _candidates(output: NDArray[np.float32], kinds: NDArray[np.intp], floor: float, every_kind: bool) -> Boxes:
+    """Boxes of one image from the network's output (4 + K, anchors): centre, size, scores of the K ``kinds``."""
     scores = output[4:]
     if every_kind:
         kind, anchor = np.nonzero(scores >= floor)
@@ -92,7 +94,7 @@ def _candidates(output: NDArray[np.float32], floor: float, every_kind: bool) -> 
         kind = best[anchor]
     score = scores[kind, anchor]
     centre, half = output[0:2, anchor].T, output[2:4, anchor].T / 2
-    return Boxes(np.concatenate((centre - half, centre + half), axis=1), kind, score)
+    return Boxes(np.concatenate((centre - half, centre + half), axis=1), kinds[kind], score)
 
 
 def overlap(box: BoxArray, others: BoxArray) -> NDArray[np.float32]:

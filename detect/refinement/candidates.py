@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from detect.detection import Detection
 from detect.refinement.evidence import laplace, longest
 from detect.refinement.fit import SIMPLER, TIES, Fit, again, again_alone, primitive_of, search
-from detect.refinement.map_cells import MapCells, circumradius
+from detect.refinement.map_cells import MapCells
 from detect.refinement.rays import Backdrop, Beams, Obstacles, Sensor, backdrop, before, map_says, parameters
 from detect.refinement.walls import Wall, walls_behind
 from prim.arrays import FloatArray
@@ -158,7 +158,7 @@ def apart(a: Primitive, b: Primitive) -> float:
 
 def share_of(a: Primitive, b: Primitive) -> float:
     """How much two primitives share, of the smaller one's area."""
-    if apart(a, b) > circumradius(a) + circumradius(b):
+    if apart(a, b) > a.circumradius + b.circumradius:
         return 0.0
     first, second, shared = polygon_areas(a, b)
     return shared / min(first, second)

@@ -10,11 +10,11 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-from detect.refinement.fit import NAMES, SIMPLER, TIES, Fit, primitive_of
+from detect.refinement.fit import SIMPLER, TIES, Fit, primitive_of
 from detect.refinement.kernels import MISS, PARAMETERS, costs, margins, slopes
 from detect.refinement.rays import FAMILY, Beams, Sensor
 from prim.arrays import FloatArray
-from prim.shapes import SIZE_KEYS, Kind, Primitive
+from prim.shapes import Kind, Primitive
 
 SAME_SIZES = 0.0005
 """Sizes that differ by less than this (m) are the same: no thing is made, and no pose known, better."""
@@ -39,15 +39,10 @@ LEAST_STD = (1e-4, 1e-4, 1e-3, 1e-4, 1e-4)
 MOST_TURN = 0.5
 """Bounds on what samples are spread over (m, rad)."""
 
-HALF = (Kind.CIRCLE, Kind.ELLIPSE)
-"""Kinds whose sizes are half lengths."""
-
-PERIOD = {Kind.SQUARE: math.pi / 2, Kind.RECTANGLE: math.pi, Kind.TRIANGLE: 2 * math.pi, Kind.ELLIPSE: math.pi}
-
 
 def longest(kind: Kind) -> float:
     """What a kind's sizes stay below (m)."""
-    return LONGEST / 2 if kind in HALF else LONGEST
+    return LONGEST / kind.extent
 
 
 def log_prior(kind: Kind) -> float:
@@ -56,9 +51,9 @@ def log_prior(kind: Kind) -> float:
     All sizes up to LONGEST and all angles are alike. A rectangle is found in one of two ways to name its sides (and
     an ellipse its axes), each of them half of what it might be.
     """
-    sizes = len(SIZE_KEYS[kind]) * math.log(2 / LONGEST if kind in HALF else 1 / LONGEST)
-    angle = -math.log(PERIOD[kind]) if kind in PERIOD else 0.0
-    return sizes + angle + (math.log(2) if kind in (Kind.RECTANGLE, Kind.ELLIPSE) else 0.0)
+    sizes = len(kind.sizes) * math.log(kind.extent / LONGEST)
+    angle = 0.0 if kind.row.period is None else -math.log(kind.row.period)
+    return sizes + angle + (math.log(2) if kind.longer_first else 0.0)
 
 
 def laplace(fit: Fit, dispersion: float = 1.0) -> float:
@@ -173,7 +168,7 @@ def _tempered(weight: FloatArray, least: float) -> FloatArray:
 def _bounded(covariance: NDArray[np.floating], kind: Kind, floor: FloatArray) -> FloatArray:
     """A covariance that samples can be drawn with: no narrower than ``floor``, no wider in angle than MOST_TURN."""
     bounded = covariance + np.diag(floor**2)
-    if kind is not Kind.CIRCLE and bounded[2, 2] > MOST_TURN**2:
+    if kind.has_angle and bounded[2, 2] > MOST_TURN**2:
         shrink = np.ones(len(bounded))
         shrink[2] = MOST_TURN / math.sqrt(bounded[2, 2])
         bounded = bounded * shrink * shrink[:, None]
@@ -279,8 +274,8 @@ def _simpler_ones(
 def told(kind: Kind, made: Sampled) -> tuple[Primitive, dict[str, float], FloatArray]:
     """The primitive that samples tell, its standard deviations by name, and its covariance in their order."""
     primitive = primitive_of(kind, TIES[kind] @ made.mean)
-    names, covariance = NAMES[kind], made.covariance
-    if kind in (Kind.RECTANGLE, Kind.ELLIPSE) and made.mean[3] < made.mean[4]:
+    names, covariance = kind.parameters, made.covariance
+    if kind.longer_first and made.mean[3] < made.mean[4]:
         order = [0, 1, 2, 4, 3]
         covariance = covariance[np.ix_(order, order)]
     std = np.sqrt(np.diag(covariance)).tolist()

@@ -11,7 +11,7 @@ import numpy as np
 from detect.refinement.kernels import PARAMETERS, costs, descend
 from detect.refinement.rays import FAMILY, Beams, Sensor, parameters
 from prim.arrays import FloatArray
-from prim.shapes import SIZE_KEYS, Kind, Primitive
+from prim.shapes import Kind, Primitive
 
 COARSE_RAYS, SEARCH_RAYS = 800, 1600
 """To about so many rays starts are fitted, and what comes of the best of them."""
@@ -49,7 +49,7 @@ WAYS = 2
 ALIKE = 1.3
 """A triangle whose sides are no more unlike than this may have been fitted with the wrong apex."""
 
-SIMPLER = {Kind.RECTANGLE: Kind.SQUARE, Kind.ELLIPSE: Kind.CIRCLE}
+SIMPLER = {kind: kind.special_case for kind in Kind if kind.special_case is not None}
 """Kinds that are special cases of others; each is fitted wherever the other is."""
 
 STRETCHED = 1.03
@@ -84,58 +84,46 @@ class Share:
         return cls(beams.of(slice(None, None, each)), each) if each > 1 else cls(beams)
 
 
-def _ties() -> dict[Kind, FloatArray]:
-    """For each kind the matrix (5, K) from its own parameters to x, y, theta, width, height."""
+def _tie(kind: Kind) -> FloatArray:
+    """The matrix (5, K) from a kind's own parameters to x, y, theta, width, height."""
     full = np.eye(PARAMETERS)
-    tied = full[:, :4].copy()
-    tied[4, 3] = 1.0
-    return {
-        Kind.SQUARE: tied,
-        Kind.RECTANGLE: full,
-        Kind.CIRCLE: np.ascontiguousarray(tied[:, [0, 1, 3]]),
-        Kind.TRIANGLE: full,
-        Kind.ELLIPSE: full,
-    }
+    columns = [full[0], full[1], *([full[2]] if kind.has_angle else [])]
+    columns += [full[3] + full[4]] if kind.is_tied else [full[3], full[4]]
+    return np.column_stack(columns)
 
 
-TIES = _ties()
+TIES = {kind: _tie(kind) for kind in Kind}
 """For each kind the matrix (5, K) that maps its own parameters to x, y, theta, width, height."""
-
-NAMES = {kind: ("x", "y", *(() if kind is Kind.CIRCLE else ("theta",)), *SIZE_KEYS[kind]) for kind in Kind}
-"""For each kind its own parameters' names, in the order of TIES' columns."""
-
-
-MOMENTS = {
-    Kind.SQUARE: (12.0, 12.0),
-    Kind.RECTANGLE: (12.0, 12.0),
-    Kind.CIRCLE: (4.0, 4.0),
-    Kind.TRIANGLE: (24.0, 18.0),
-    Kind.ELLIPSE: (4.0, 4.0),
-}
-"""A size's square is so many times the variance of the area along it."""
 
 
 def starts(of: Primitive, kind: Kind) -> list[FloatArray]:
     """Where the fit of a kind begins, for something that was first taken for ``of``: same place, same spread."""
     x, y, theta, *sizes = parameters(of).tolist()
-    spread = [size / math.sqrt(factor) for size, factor in zip(sizes, MOMENTS[of.kind], strict=True)]
-    if kind is Kind.TRIANGLE:
-        turns = [0.0, math.pi / 2, math.pi, -math.pi / 2]
-        if of.kind is kind:
-            turns += [2 * math.pi / 3, -2 * math.pi / 3]
-    else:
-        turns = [0.0] if kind is Kind.CIRCLE else [0.0, math.pi / 4]
+    spread = [size * math.sqrt(variance) for size, variance in zip(sizes, of.kind.unit_variances, strict=True)]
     made = []
     mean = math.sqrt(spread[0] * spread[1])
-    for turn in turns:
+    for turn in start_turns(kind, of.kind):
         along, across = spread
         if abs(math.sin(turn)) > 0.9:
             along, across = across, along
-        elif abs(math.sin(turn)) > 0.1 or kind in (Kind.SQUARE, Kind.CIRCLE):
+        elif abs(math.sin(turn)) > 0.1 or kind.is_tied:
             along = across = mean
-        a, b = (math.sqrt(factor) for factor in MOMENTS[kind])
-        made.append(np.array([x, y, 0.0 if kind is Kind.CIRCLE else theta + turn, a * along, b * across]))
+        a, b = (math.sqrt(1 / variance) for variance in kind.unit_variances)
+        made.append(np.array([x, y, theta + turn if kind.has_angle else 0.0, a * along, b * across]))
     return made
+
+
+def start_turns(kind: Kind, of: Kind) -> list[float]:
+    """Angles (rad) from something that was taken for a kind to the starts of another kind's fit."""
+    row = kind.row
+    if row.period is None:
+        return [0.0]
+    if kind.longer_first or row.period <= math.pi / 2:
+        return [0.0, min(row.period, math.pi / 2) / 2]
+    turns = [0.0, math.pi / 2, math.pi, -math.pi / 2]
+    if kind is of and row.regular_period is not None:
+        turns += [row.regular_period, -row.regular_period]
+    return turns
 
 
 def search(now: Primitive, before: Sequence[Fit], beams: Beams, sensor: Sensor) -> list[Fit]:
@@ -191,9 +179,8 @@ def _finely(ways: Sequence[Way], share: Share, sensor: Sensor, how: Descent) -> 
                 best[fit.kind] = fit
 
     keep(_fit_each(ways, share, sensor, how))
-    if Kind.TRIANGLE in best:
-        others = [(Kind.TRIANGLE, p) for p in other_apexes(best[Kind.TRIANGLE].p)]
-        keep(_fit_each(others, share, sensor, how))
+    others = [(kind, p) for kind, fit in best.items() if kind.corners == 3 for p in other_apexes(fit.p)]
+    keep(_fit_each(others, share, sensor, how))
     stuck = [
         (kind, p)
         for kind, simple in SIMPLER.items()
@@ -208,7 +195,7 @@ def unlike(kind: Kind, p: FloatArray) -> list[FloatArray]:
     """Where the fit of a ``kind`` begins whose special case has parameters ``p``: with these for a rectangle, in four
     directions a little longer for an ellipse, since a circle has none to turn to.
     """
-    if kind is Kind.RECTANGLE:
+    if SIMPLER[kind].has_angle:
         return [p]
     longer = np.array([STRETCHED, 1 / STRETCHED])
     turns = [quarter * math.pi / 4 for quarter in range(4)]
@@ -266,5 +253,5 @@ def _fit_each(ways: Sequence[Way], share: Share, sensor: Sensor, how: Descent) -
 def primitive_of(kind: Kind, p: FloatArray) -> Primitive:
     """A primitive of five parameters, in canonical form."""
     x, y, theta, width, height = p.tolist()
-    size = (width, height)[: len(SIZE_KEYS[kind])]
-    return Primitive(kind, x, y, None if kind is Kind.CIRCLE else theta, size).canonical()
+    size = (width, height)[: len(kind.sizes)]
+    return Primitive(kind, x, y, theta if kind.has_angle else None, size).canonical()

@@ -14,7 +14,7 @@ from detect.refinement.lines import Line, find_lines, middle_line, off_line
 from mapping.grid import GridFrame, OccupancyGrid
 from mapping.morphology import beside_free, centres, connected_components, dilate
 from prim.arrays import BoolGrid, FloatArray
-from prim.shapes import Kind, Primitive
+from prim.shapes import Primitive
 
 LARGE = 0.75
 """What hangs together over more than this (m) is no primitive."""
@@ -99,7 +99,7 @@ class MapCells:
 
     def large_within(self, primitive: Primitive, margin: float) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
         """Rows and columns of large things' cells in a primitive and within ``margin`` (m) of it."""
-        rows, cols, points = _cells_around(self.frame, primitive, circumradius(primitive) + margin)
+        rows, cols, points = _cells_around(self.frame, primitive, primitive.circumradius + margin)
         at_rows, at_cols = np.nonzero(self.large[rows, cols] & is_within(primitive, points, margin))
         return at_rows + rows.start, at_cols + cols.start
 
@@ -120,7 +120,7 @@ class MapCells:
         """
         occupied = self.occupied.copy()
         for primitive in primitives:
-            rows, cols, points = _cells_around(self.frame, primitive, circumradius(primitive) + margin)
+            rows, cols, points = _cells_around(self.frame, primitive, primitive.circumradius + margin)
             near, touching = (is_within(primitive, points, reach) for reach in (margin, min(margin, TOUCHING)))
             occupied[rows, cols] &= ~np.where(self.large[rows, cols], touching, near)
         return occupied
@@ -199,16 +199,6 @@ def _free_side(line: Line, on_it: FloatArray, free: FloatArray, resolution: floa
     if below < ONE_SIDED * above:
         return 1.0
     return -1.0 if above < ONE_SIDED * below else 0.0
-
-
-def circumradius(primitive: Primitive) -> float:
-    """How far (m) a primitive reaches from its centroid."""
-    width, height = primitive.width_height
-    if primitive.is_round:
-        return max(width, height)
-    if primitive.kind is Kind.TRIANGLE:
-        return max(2 / 3 * height, math.hypot(width / 2, height / 3))
-    return math.hypot(width, height) / 2
 
 
 def is_within(primitive: Primitive, points: NDArray[np.floating], margin: float) -> NDArray[np.bool_]:

@@ -12,7 +12,7 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from detect.refinement.map_cells import MapCells, circumradius, is_within
+from detect.refinement.map_cells import MapCells, is_within
 from mapping.morphology import dilate
 from prim.arrays import FloatArray
 from prim.shapes import Kind, Primitive
@@ -38,14 +38,14 @@ def proposals(cells: MapCells, found: Sequence[Primitive], most: int = MOST_PROP
     """Rectangles around things in a map that are in no primitive ``found``, the ``most`` largest."""
     made = []
     middles = np.array([(one.x, one.y) for one in found]).reshape(-1, 2)
-    reaches = np.array([circumradius(one) + NEAR for one in found])
+    reaches = np.array([one.circumradius + NEAR for one in found])
     for points in blobs(cells):
         around = rectangle_around(points, cells.frame.resolution)
         if around is None or cells.hide(around):
             continue
         inside = np.zeros(len(points), np.bool_)
         apart = np.hypot(*(middles - (around.x, around.y)).T)
-        for near in np.flatnonzero(apart < reaches + circumradius(around)).tolist():
+        for near in np.flatnonzero(apart < reaches + around.circumradius).tolist():
             inside |= is_within(found[near], points, NEAR)
         if inside.mean() <= COVERED:
             made.append((len(points), around))

@@ -31,7 +31,6 @@ from detect.refinement.kernels import (
     tables,
     walk,
 )
-from detect.refinement.map_cells import circumradius
 from mapping.forward.mapper import neighbour_noise
 from mapping.grid import GridFrame
 from prim.arrays import FloatArray
@@ -258,7 +257,7 @@ def gather(
 ) -> tuple[list[Beams], float, float]:
     """The rays that come within ``reach`` (m) of each primitive, the largest span of ranges, the most noise (m)."""
     centres = np.array([(one.x, one.y) for one in primitives]).reshape(-1, 2)
-    gatherer = Gatherer(centres, np.array([circumradius(one) + reach for one in primitives]))
+    gatherer = Gatherer(centres, np.array([one.circumradius + reach for one in primitives]))
     for scan, pose in scans:
         gatherer.add(scan, pose)
     return gatherer.beams(), gatherer.span, gatherer.most_noise
@@ -317,7 +316,7 @@ def before(beams: Beams, behind: Backdrop, by_map: FloatArray, others: Sequence[
     rays[STOP] = FAR
     rays[MISS] = by_map
     for other in others:
-        stop_at(FAMILY[other.kind], parameters(other), circumradius(other), rays)
+        stop_at(FAMILY[other.kind], parameters(other), other.circumradius, rays)
     shade(rays, beams.kinds, behind.stops, behind.blocked, sensor.std, sensor.table)
     return replace(beams, rays=rays)
 

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from detect.refinement.lines import Line, find_lines, middle_line, off_line
-from detect.refinement.map_cells import MapCells, circumradius, is_within
+from detect.refinement.map_cells import MapCells, is_within
 from prim.arrays import FloatArray
 from prim.shapes import Kind, Primitive
 
@@ -73,9 +73,9 @@ def walls_behind(cells: MapCells, candidates: Sequence[Primitive], starts: Seque
     places = np.array([(one.x, one.y) for one in candidates])
     made = []
     for one, start in zip(candidates, starts, strict=True):
-        reach = circumradius(one) + AROUND
+        reach = one.circumradius + AROUND
         near = points[_around(one, points, reach)]
-        if not is_within(one, near[_around(one, near, circumradius(one) + CLOSE)], CLOSE).any():
+        if not is_within(one, near[_around(one, near, one.circumradius + CLOSE)], CLOSE).any():
             continue
         for other in np.flatnonzero(_around(one, places, 2 * reach)).tolist():
             near = near[~is_within(candidates[other], near, OWN)]
@@ -103,7 +103,7 @@ def _stretch(cells: MapCells, candidate: Primitive, start: Primitive, line: Line
     on_line = points[off_line(points, line) < (BENT + 0.5) * resolution]
     along = on_line @ np.array([-ny, nx])
     middle = -ny * candidate.x + nx * candidate.y
-    reach = circumradius(candidate)
+    reach = candidate.circumradius
     left, right = along[along < middle - 0.5 * reach], along[along > middle + 0.5 * reach]
     if min(len(np.unique(np.rint(part / resolution))) for part in (left, right)) * resolution < LEAST_LENGTH:
         return None

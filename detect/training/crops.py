@@ -75,8 +75,7 @@ def mirrored(primitive: Primitive) -> Primitive:
     """A primitive in a world whose x is turned over."""
     theta = primitive.theta
     if theta is not None:
-        # the local x axis turns to pi - theta; a triangle's apex must stay on local +y, which takes half a turn more
-        theta = -theta if primitive.kind is Kind.TRIANGLE else math.pi - theta
+        theta = -theta  # every unit outline is its own mirror image about the local y axis
     return replace(primitive, x=-primitive.x, theta=theta).canonical()
 
 

@@ -33,6 +33,12 @@ FRAME = GridFrame(RESOLUTION, 0, 0, TILE, TILE)
 SIZES = (0.06, 0.34)
 """Between these (m) lie a drawing's widths and heights: a little more than what the recorder draws."""
 
+RADII = (0.045, 0.3)
+"""And its circles' radii."""
+
+LEAST_HEIGHT = 0.06
+"""A triangle is at least this high (m)."""
+
 MOST_PER_KIND = 3
 GAP = 4.0
 """Boxes of two primitives are at least this many cells apart."""
@@ -126,24 +132,21 @@ def _scatter_primitives(rng: np.random.Generator) -> list[Primitive]:
 
 
 def _angle(kind: Kind, rng: np.random.Generator) -> float | None:
-    return None if kind is Kind.CIRCLE else float(rng.uniform(0, 2 * math.pi))
+    return float(rng.uniform(0, 2 * math.pi)) if kind.has_angle else None
 
 
 def _size(kind: Kind, rng: np.random.Generator) -> tuple[float, ...]:
-    """Sizes (m), drawn again until a rectangle is no square, nor an ellipse a circle."""
+    """Sizes (m), drawn again until nothing is its kind's special case, nor too flat or too long."""
     low, high = SIZES
-    if kind is Kind.SQUARE:
-        return (float(rng.uniform(low, high)),)
-    if kind is Kind.CIRCLE:
-        return (float(rng.uniform(0.045, 0.3)),)
+    if kind.is_tied:
+        return (float(rng.uniform(*(RADII if kind.is_round else SIZES))),)
     while True:
         a, b = (float(value) for value in rng.uniform(low, high, 2))
-        if kind is Kind.TRIANGLE:
-            if b >= 0.06 and math.hypot(a / 2, b) <= high:
-                return a, b
-        elif max(a, b) > 1.05 * min(a, b):
-            half = 0.5 if kind is Kind.ELLIPSE else 1.0
-            return half * max(a, b), half * min(a, b)
+        if kind.longer_first:
+            if max(a, b) > 1.05 * min(a, b):
+                return max(a, b) / kind.extent, min(a, b) / kind.extent
+        elif b >= LEAST_HEIGHT and max(Primitive(kind, 0.0, 0.0, 0.0, (a, b)).sides) <= high:
+            return a, b
 
 
 def _apart(a: tuple[float, float, float, float], b: tuple[float, float, float, float]) -> bool:

@@ -19,7 +19,7 @@ from prim.arrays import FloatArray
 from prim.log.cdr import SECOND, CdrReader
 from prim.scan import Scan
 from prim.se2 import Pose2D
-from prim.shapes import Kind, Primitive
+from prim.shapes import Primitive
 from prim.world import World
 
 SCAN_TOPIC = "/scan"
@@ -45,15 +45,6 @@ MAP_FRAME = "map"
 ODOM_FRAME = "odom"
 BASE_FRAME = "base_link"
 LASER_FRAME = "laser"
-
-KIND_COLORS: dict[Kind, tuple[int, int, int]] = {
-    Kind.SQUARE: (86, 180, 233),
-    Kind.RECTANGLE: (0, 158, 115),
-    Kind.CIRCLE: (230, 159, 0),
-    Kind.TRIANGLE: (213, 94, 0),
-    Kind.ELLIPSE: (204, 121, 167),
-}
-"""One colour per kind (RGB), from Okabe and Ito's palette for all kinds of colour vision."""
 
 _SCAN_HEAD, _SCAN_GEOMETRY = struct.Struct("<iII"), struct.Struct("<7fI")
 _LITTLE_ENDIAN = b"\x00\x01\x00\x00"
@@ -354,7 +345,7 @@ def _primitive_marker(stamp: int, index: int, primitive: Primitive) -> Any:
     outline = primitive.local_outline(64)
     text = json.dumps({"kind": str(primitive.kind), "size": primitive.sizes})
     pose = Pose2D(primitive.x, primitive.y, primitive.theta or 0.0)
-    color = KIND_COLORS[primitive.kind]
+    color = primitive.kind.row.color
     return _marker(stamp, "primitives", index, _LINE_STRIP, pose, [*outline, outline[0]], text, color)
 
 

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from mapping.map_metrics import map_scores
 from mapping.morphology import dilate
 from prim.metrics import detection_errors, match_primitives, polygon_iou, pose_rmse
-from prim.shapes import SIZE_KEYS, Kind, Primitive
+from prim.shapes import Kind, Primitive
 
 
 def circle(x: float, radius: float = 0.1) -> Primitive:
@@ -35,9 +35,7 @@ def test_iou_of_shifted_squares() -> None:
 def test_what_all_but_agrees_overlaps_in_full(
     kind: Kind, theta: float, sizes: tuple[float, float], moved: float
 ) -> None:
-    shape = Primitive(
-        kind, 0.3, -0.2, None if kind is Kind.CIRCLE else theta, sizes[: len(SIZE_KEYS[kind])]
-    ).canonical()
+    shape = Primitive(kind, 0.3, -0.2, None if kind is Kind.CIRCLE else theta, sizes[: len(kind.sizes)]).canonical()
     assert polygon_iou(shape, replace(shape, x=shape.x + moved)) > 0.9999
 
 

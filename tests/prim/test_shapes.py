@@ -6,7 +6,7 @@ import shapely
 from hypothesis import given
 from hypothesis import strategies as st
 
-from prim.shapes import SIZE_KEYS, Kind, Primitive, angle_difference, angle_error
+from prim.shapes import Kind, Primitive, angle_difference, angle_error
 
 LENGTHS = st.floats(0.02, 0.5)
 ANGLES = st.floats(-10, 10)
@@ -16,7 +16,7 @@ ANGLES = st.floats(-10, 10)
 def primitives(draw: st.DrawFn, kinds: tuple[Kind, ...] = tuple(Kind)) -> Primitive:
     kind = draw(st.sampled_from(kinds))
     theta = None if kind is Kind.CIRCLE else draw(ANGLES)
-    size = tuple(draw(LENGTHS) for _ in SIZE_KEYS[kind])
+    size = tuple(draw(LENGTHS) for _ in kind.sizes)
     return Primitive(kind, draw(st.floats(-1, 1)), draw(st.floats(-1, 1)), theta, size)
 
 

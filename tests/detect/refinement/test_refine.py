@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from detect.detection import Detection, Detections, Rejection
 from detect.refinement.candidates import Candidate, fit_all, look_behind
 from detect.refinement.evidence import exact_costs
-from detect.refinement.fit import MOMENTS, TIES, Fit, again, other_apexes, primitive_of, starts
+from detect.refinement.fit import TIES, Fit, again, other_apexes, primitive_of, starts
 from detect.refinement.lines import find_lines
 from detect.refinement.map_cells import MapCells, OneSided, is_within
 from detect.refinement.proposals import proposals
@@ -35,7 +35,7 @@ from mapping.grid import GridFrame, OccupancyGrid
 from prim.metrics import polygon_iou
 from prim.scan import Scan
 from prim.se2 import Pose2D
-from prim.shapes import SIZE_KEYS, Kind, Primitive, angle_error
+from prim.shapes import Kind, Primitive, angle_error
 from prim.world import World
 from tests.detect.refinement.rooms import mapped, room, scans, shape
 
@@ -98,9 +98,9 @@ def test_noisy_rays_tell_kind_size_noise_and_how_sure_all_is(
     for made, true in zip(refined, world.primitives, strict=True):
         assert made is not None and made.primitive.kind is true.kind and made.score > 0.5
         assert sum(made.chances.values()) == pytest.approx(1.0)
-        assert set(made.std) == {"x", "y", *(() if true.theta is None else ("theta",)), *SIZE_KEYS[true.kind]}
+        assert set(made.std) == {"x", "y", *(() if true.theta is None else ("theta",)), *true.kind.sizes}
         normal += [(made.primitive.x - true.x) / made.std["x"], (made.primitive.y - true.y) / made.std["y"]]
-        normal += [(made.primitive.size[0] - true.size[0]) / made.std[SIZE_KEYS[true.kind][0]]]
+        normal += [(made.primitive.size[0] - true.size[0]) / made.std[true.kind.sizes[0]]]
         assert np.sqrt(np.diag(made.covariance)).tolist() == pytest.approx(list(made.std.values()))
     assert 0.4 < np.sqrt(np.mean(np.square(normal))) < 2.0
 
@@ -346,8 +346,8 @@ def test_starts_keep_place_and_spread(kind: Kind) -> None:
     for of in FIVE:
         for p in starts(of, kind):
             assert p[:2].tolist() == [of.x, of.y]
-            spread = np.prod(p[3:]) / math.sqrt(np.prod(MOMENTS[kind]))
-            assert spread == pytest.approx(np.prod(of.width_height) / math.sqrt(np.prod(MOMENTS[of.kind])))
+            spread = np.prod(p[3:]) / math.sqrt(1 / np.prod(kind.unit_variances))
+            assert spread == pytest.approx(np.prod(of.width_height) / math.sqrt(1 / np.prod(of.kind.unit_variances)))
 
 
 def test_straight_lines_are_found_the_longest_first() -> None:
