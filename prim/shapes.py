@@ -173,12 +173,12 @@ class Kind(StrEnum):
         return math.pi if self.is_round else round(_moments(self.vertices)[0], 12)
 
     @cached_property
-    def unit_variances(self) -> tuple[float, float]:
-        """The variances of the unit outline's area along x and y."""
+    def spread_factors(self) -> tuple[float, float]:
+        """How many times the variance of the area along x and y the squares of width and height are."""
         if self.is_round:
-            return 0.25, 0.25
+            return 4.0, 4.0
         area, along_x, along_y = _moments(self.vertices)
-        return along_x / area, along_y / area
+        return round(area / along_x, 9), round(area / along_y, 9)
 
 
 def _rounded(vertex: tuple[float, float]) -> tuple[float, float]:

@@ -99,7 +99,7 @@ TIES = {kind: _tie(kind) for kind in Kind}
 def starts(of: Primitive, kind: Kind) -> list[FloatArray]:
     """Where the fit of a kind begins, for something that was first taken for ``of``: same place, same spread."""
     x, y, theta, *sizes = parameters(of).tolist()
-    spread = [size * math.sqrt(variance) for size, variance in zip(sizes, of.kind.unit_variances, strict=True)]
+    spread = [size / math.sqrt(factor) for size, factor in zip(sizes, of.kind.spread_factors, strict=True)]
     made = []
     mean = math.sqrt(spread[0] * spread[1])
     for turn in start_turns(kind, of.kind):
@@ -108,7 +108,7 @@ def starts(of: Primitive, kind: Kind) -> list[FloatArray]:
             along, across = across, along
         elif abs(math.sin(turn)) > 0.1 or kind.is_tied:
             along = across = mean
-        a, b = (math.sqrt(1 / variance) for variance in kind.unit_variances)
+        a, b = (math.sqrt(factor) for factor in kind.spread_factors)
         made.append(np.array([x, y, theta + turn if kind.has_angle else 0.0, a * along, b * across]))
     return made
 

@@ -346,8 +346,8 @@ def test_starts_keep_place_and_spread(kind: Kind) -> None:
     for of in FIVE:
         for p in starts(of, kind):
             assert p[:2].tolist() == [of.x, of.y]
-            spread = np.prod(p[3:]) / math.sqrt(1 / np.prod(kind.unit_variances))
-            assert spread == pytest.approx(np.prod(of.width_height) / math.sqrt(1 / np.prod(of.kind.unit_variances)))
+            spread = np.prod(p[3:]) / math.sqrt(np.prod(kind.spread_factors))
+            assert spread == pytest.approx(np.prod(of.width_height) / math.sqrt(np.prod(of.kind.spread_factors)))
 
 
 def test_straight_lines_are_found_the_longest_first() -> None:
