@@ -11,10 +11,18 @@ Kernel = TypeVar("Kernel", bound=Callable[..., Any])
 
 
 def compiled(cache: bool = True, **options: Any) -> Callable[[Kernel], Kernel]:
-    """Numba's compiler; its code is cached where there is a place that can be written.
+    """Make a decorator that compiles a function with numba.
 
-    A function that other kernels call is to be built into them (``forceinline``) and not cached by itself: else it
-    depends on what was in the cache which of two translations is run, and with that the last bits of a sum.
+    A function that other kernels call is to be inlined into them and not cached by itself: else the state of the
+    cache decides which of two translations is run, and with that the last bits of a sum.
+
+    Args:
+        cache: Whether the compiled code is kept in a file, where there is a folder that can be written.
+        **options: Further options of numba.njit.
+
+    Returns:
+        The decorator.
+
     """
 
     def compile_it(function: Kernel) -> Kernel:
@@ -28,5 +36,7 @@ def compiled(cache: bool = True, **options: Any) -> Callable[[Kernel], Kernel]:
 
 
 kernel = compiled(inline="never")
+"""Decorator of a kernel that Python calls."""
 
 inline = compiled(inline="always")
+"""Decorator of a function that kernels call: it becomes part of each of them."""

@@ -1,4 +1,4 @@
-"""How every command of prim starts and ends: one line per error, no traceback, the exit codes in one place."""
+"""What all commands of prim share: errors as one line without a traceback, exit codes, the progress bar."""
 
 from __future__ import annotations
 
@@ -19,20 +19,28 @@ INTERRUPTED = 130
 
 
 def run(app: typer.Typer, name: str, arguments: Sequence[str]) -> int:
-    """Runs a command line and returns its exit code.
+    """Run a command line.
 
-    0: done; 1: an input that cannot be used, or a bug; 2: usage; 3: done, but part of a log was lost.
+    Args:
+        app: The command.
+        name: Its name, as error messages begin with it.
+        arguments: Its arguments.
+
+    Returns:
+        The exit code. 0: done; 1: an input that cannot be used, or a bug; 2: usage; 3: done, but part of a log was
+        lost; 130: interrupted.
+
     """
     debug = "--debug" in arguments
-    gc.set_threshold(100_000, 50, 50)  # imports make many objects that stay: looking through them takes 0.4 s
+    gc.set_threshold(100_000, 50, 50)  # imports make many objects that stay: collecting among them takes 0.4 s
     try:
         code = typer.main.get_command(app)(list(arguments), prog_name=name, standalone_mode=False)
-        return _complain(name, "interrupted", INTERRUPTED) if code == INTERRUPTED else int(code or 0)
+        return _print_line(name, "interrupted", INTERRUPTED) if code == INTERRUPTED else int(code or 0)
     except typer.TyperException as error:
         what = error.format_message().replace("Value error, ", "")
-        return _complain(name, f"{what} (try: {name} --help)", USAGE)
+        return _print_line(name, f"{what} (try: {name} --help)", USAGE)
     except PrimError as error:
-        return complain(name, error, debug)
+        return print_error(name, error, debug)
     except BrokenPipeError:
         sys.stdout = open(os.devnull, "w", encoding="utf-8")  # noqa: PTH123, SIM115 - the reader has gone
         return 0
@@ -40,32 +48,52 @@ def run(app: typer.Typer, name: str, arguments: Sequence[str]) -> int:
         if debug:
             traceback.print_exc()
         what = f"unexpected {type(error).__name__}: {error}"
-        return _complain(name, f"{what} (this is a bug: --debug shows the traceback)", FAILED)
+        return _print_line(name, f"{what} (this is a bug: --debug shows the traceback)", FAILED)
 
 
-def complain(name: str, error: PrimError, debug: bool = False) -> int:
-    """Prints an expected error's one line (with ``debug`` its traceback before it); returns its exit code."""
+def print_error(name: str, error: PrimError, debug: bool = False) -> int:
+    """Print an expected error as one line on stderr.
+
+    Args:
+        name: The command's name.
+        error: The error.
+        debug: Print its traceback before.
+
+    Returns:
+        The exit code that goes with it.
+
+    """
     if debug:
         traceback.print_exception(error)
-    return _complain(name, str(error), error.exit_code)
+    return _print_line(name, str(error), error.exit_code)
 
 
 @contextmanager
-def progress_bar(what: str, quiet: bool) -> Iterator[Callable[[int, int], None] | None]:
-    """A bar on the terminal, to be told what is done and what there is in all; None where nobody looks."""
+def progress_bar(label: str, quiet: bool) -> Iterator[Callable[[int, int], None] | None]:
+    """Show a progress bar on stderr.
+
+    Args:
+        label: What is written before the bar.
+        quiet: Show none.
+
+    Yields:
+        A function that is called with how much is done and how much there is in all; None where no bar is shown:
+        when quiet, or where stderr is no terminal.
+
+    """
     if quiet or not sys.stderr.isatty():
         yield None
         return
     from rich.console import Console
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-    columns = (TextColumn(what), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+    columns = (TextColumn(label), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
     with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
-        task = bar.add_task(what, total=None)
+        task = bar.add_task(label, total=None)
         yield lambda done, total: bar.update(task, completed=done, total=total)
 
 
-def _complain(name: str, what: str, code: int) -> int:
+def _print_line(name: str, what: str, code: int) -> int:
     line = " ".join(what.split())
     print(f"{name}: error: {line}", file=sys.stderr)
     return code

@@ -1,4 +1,4 @@
-"""The errors that users cause and can mend; everything else is a bug."""
+"""The expected errors: those that a user can mend. Any other exception is a bug."""
 
 from __future__ import annotations
 
@@ -6,16 +6,18 @@ from pathlib import Path
 
 
 class PrimError(Exception):
-    """Base of all expected errors: one line that says what is wrong, where, and what to do.
+    """Base of all expected errors; the message is one line: what is wrong, where, and what to do.
 
-    ``exit_code`` is what a command exits with: 2 for usage, 1 for an input that cannot be used.
+    Attributes:
+        exit_code: What a command exits with: 2 for usage, 1 for an input that cannot be used.
+
     """
 
     exit_code = 1
 
 
 class UsageError(PrimError):
-    """Options that are impossible by themselves or together."""
+    """Options that are invalid by themselves or together."""
 
     exit_code = 2
 
@@ -23,7 +25,11 @@ class UsageError(PrimError):
 class LogReadError(PrimError):
     """A log that cannot be read, or that lacks what was asked of it.
 
-    Carries the ``path``, ``what`` is wrong, and a ``hint`` that says what to do about it.
+    Attributes:
+        path: The log.
+        what: What is wrong with it.
+        hint: What to do about it; may be empty.
+
     """
 
     def __init__(self, path: str | Path, what: str, hint: str = "") -> None:
@@ -42,10 +48,10 @@ class OutputError(PrimError):
 
 
 class InterruptedRecordingError(PrimError):
-    """A recording that was broken off, and where what was recorded until then lies."""
+    """A recording that was interrupted; the message names the file that holds the recorded part."""
 
     exit_code = 130
 
 
 class WorldError(PrimError):
-    """A world file that does not describe a world."""
+    """A world file that cannot be read or does not describe a world."""

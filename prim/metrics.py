@@ -1,4 +1,4 @@
-"""How good detections and maps are: one definition for replay, evaluation and benchmarks."""
+"""Error metrics of detections and poses: one definition for replay, evaluation and benchmarks."""
 
 from __future__ import annotations
 
@@ -10,18 +10,31 @@ from typing import SupportsInt
 import numpy as np
 
 from prim.arrays import FloatArray
+from prim.se2 import wrap_angles
 from prim.shapes import Primitive, angle_error
 
 FOUND_IOU = 0.5
-"""A primitive counts as found when the kind agrees and the polygons' IoU is at least this."""
+"""A pair counts as a true positive when the kinds agree and the polygons' IoU is at least this."""
 
 OVERLAY_GRID = 1e-9
-"""Vertices are rounded to this (m) before polygons meet: without it, some that all but agree share nothing."""
+"""Vertices are rounded to this (m) before polygons are intersected: else some that nearly coincide share nothing."""
 
 
 @dataclass(frozen=True, slots=True)
 class Pair:
-    """A detection and the true primitive it overlaps most, by their indices, with the errors (m, rad)."""
+    """A detection and the true primitive that it is matched with.
+
+    Attributes:
+        detection: Index of the detection.
+        truth: Index of the true primitive.
+        same_kind: Whether the kinds agree.
+        position: Distance of the centroids (m).
+        angle: Error of theta modulo the symmetry (rad); None where the kinds differ or have no angle.
+        width: Absolute error of the width in the paper's sense (m).
+        height: Absolute error of the height in the paper's sense (m).
+        iou: Intersection over union of the outlines' polygons.
+
+    """
 
     detection: int
     truth: int
@@ -34,15 +47,27 @@ class Pair:
 
     @property
     def found(self) -> bool:
-        """Whether the pair counts as a find."""
+        """Whether the pair counts as a true positive."""
         return self.same_kind and self.iou >= FOUND_IOU
 
 
 @dataclass(frozen=True, slots=True)
 class DetectionErrors:
-    """Finds over all detections and all true primitives; mean absolute errors (m, rad) over the finds.
+    """Detection rates, and mean absolute errors over the true positives.
 
-    A mean is None where nothing was found (the angle's: nothing with an angle).
+    A mean is None where there is no true positive (for the angle: none with an angle).
+
+    Attributes:
+        precision: True positives over all detections; without detections 1 if there is no true primitive, else 0.
+        recall: True positives over all true primitives; without those 1 if there is no detection, else 0.
+        f1: Harmonic mean of precision and recall.
+        position: Mean distance of the centroids (m).
+        angle: Mean error of theta (rad).
+        width: Mean error of the width (m).
+        height: Mean error of the height (m).
+        iou: Mean intersection over union.
+        pairs: All matched pairs, true positives first.
+
     """
 
     precision: float
@@ -57,14 +82,32 @@ class DetectionErrors:
 
 
 def polygon_iou(a: Primitive, b: Primitive) -> float:
-    """Intersection over union of two outlines' polygons."""
+    """Compute the intersection over union of two outlines' polygons.
+
+    Args:
+        a: One primitive.
+        b: The other.
+
+    Returns:
+        From 0 to 1.
+
+    """
     first, second, shared = polygon_areas(a, b)
     return shared / (first + second - shared)
 
 
 def polygon_areas(a: Primitive, b: Primitive) -> tuple[float, float, float]:
-    """The areas (m^2) of two outlines' polygons, and the area that they share."""
-    import shapely  # when it is needed: a replay without detections starts faster
+    """Compute the areas of two outlines' polygons and of their intersection.
+
+    Args:
+        a: One primitive.
+        b: The other.
+
+    Returns:
+        Area of ``a``, of ``b``, of the intersection (m^2).
+
+    """
+    import shapely  # here, so that a replay without detections starts faster
 
     first, second = shapely.Polygon(a.outline()), shapely.Polygon(b.outline())
     shared = shapely.intersection(first, second, grid_size=OVERLAY_GRID)
@@ -72,10 +115,18 @@ def polygon_areas(a: Primitive, b: Primitive) -> tuple[float, float, float]:
 
 
 def match_primitives(detections: Sequence[Primitive], truth: Sequence[Primitive]) -> list[Pair]:
-    """Pairs of overlapping detections and true primitives, each used once, best first.
+    """Match detections with true primitives that they overlap, one to one and greedily.
 
-    Finds go before other pairs, and larger IoU before smaller. True primitives do
-    not overlap, so that no detection overlaps two of them by half and this greedy order finds as many as any.
+    True positives go before other pairs, larger IoU before smaller. True primitives do not overlap, so that no
+    detection has an IoU of FOUND_IOU with two of them, and no other order has more true positives.
+
+    Args:
+        detections: What was detected.
+        truth: The true primitives.
+
+    Returns:
+        The pairs in the order in which they were matched.
+
     """
     candidates = [
         pair
@@ -92,7 +143,16 @@ def match_primitives(detections: Sequence[Primitive], truth: Sequence[Primitive]
 
 
 def detection_errors(detections: Sequence[Primitive], truth: Sequence[Primitive]) -> DetectionErrors:
-    """Precision, recall, F1 and mean errors of detections against the truth (the paper's Table II averages)."""
+    """Compute detection rates and mean errors (those of the paper's Table II).
+
+    Args:
+        detections: What was detected.
+        truth: The true primitives.
+
+    Returns:
+        The errors.
+
+    """
     pairs = match_primitives(detections, truth)
     found = [pair for pair in pairs if pair.found]
     precision = len(found) / len(detections) if detections else float(not truth)
@@ -111,16 +171,35 @@ def detection_errors(detections: Sequence[Primitive], truth: Sequence[Primitive]
 
 
 def pose_rmse(estimate: FloatArray, truth: FloatArray) -> tuple[float, float]:
-    """Root mean square errors of position (m) and heading (rad) of poses (N, 3), without any alignment."""
+    """Compute the root mean square errors of poses, without any alignment.
+
+    Args:
+        estimate: (N, 3) as x, y (m), theta (rad).
+        truth: (N, 3).
+
+    Returns:
+        The errors of position (m) and heading (rad).
+
+    """
     delta = estimate - truth
-    turn = (delta[:, 2] + np.pi) % (2 * np.pi) - np.pi
+    turn = wrap_angles(delta[:, 2])
     return float(np.sqrt((delta[:, :2] ** 2).sum(axis=1).mean())), float(np.sqrt((turn**2).mean()))
 
 
 def pose_nees(estimate: FloatArray, truth: FloatArray, covariances: FloatArray) -> float:
-    """The mean normalised error squared of poses (N, 3) with covariances (N, 3, 3): 3 where those are right."""
+    """Compute the mean normalised estimation error squared (NEES; Bar-Shalom, Li and Kirubarajan, 2001, 5.4).
+
+    Args:
+        estimate: (N, 3) as x, y (m), theta (rad).
+        truth: (N, 3).
+        covariances: (N, 3, 3) of the estimates.
+
+    Returns:
+        The mean; 3 is expected of consistent covariances.
+
+    """
     delta = estimate - truth
-    delta[:, 2] = (delta[:, 2] + np.pi) % (2 * np.pi) - np.pi
+    delta[:, 2] = wrap_angles(delta[:, 2])
     return float(np.einsum("ni,ni->n", delta, np.linalg.solve(covariances, delta[..., None])[..., 0]).mean())
 
 
@@ -141,12 +220,30 @@ def _pair(i: int, j: int, detection: Primitive, truth: Primitive) -> Pair:
 
 
 def f1_score(precision: float, recall: float) -> float:
-    """The harmonic mean of precision and recall; 0 where both are."""
+    """Compute the harmonic mean of precision and recall.
+
+    Args:
+        precision: From 0 to 1.
+        recall: From 0 to 1.
+
+    Returns:
+        F1; 0 where both are 0.
+
+    """
     return 2 * precision * recall / (precision + recall) if precision + recall else 0.0
 
 
-def share_of_all(part: SupportsInt, whole: SupportsInt) -> float | None:
-    """The share of a count in another; None of nothing."""
+def ratio(part: SupportsInt, whole: SupportsInt) -> float | None:
+    """Divide a count by another.
+
+    Args:
+        part: The count of some.
+        whole: The count of all.
+
+    Returns:
+        The ratio; None where ``whole`` is 0.
+
+    """
     return int(part) / int(whole) if int(whole) else None
 
 

@@ -1,4 +1,4 @@
-"""Exact distances from a point along rays to segments and ellipses, all rays against all shapes at once."""
+"""Ray casting: exact distances from a point along rays to segments and ellipses, all pairs at once."""
 
 from __future__ import annotations
 
@@ -7,13 +7,20 @@ import numpy as np
 from prim.arrays import FloatArray
 
 END_SLACK = 1e-12
-"""A segment reaches this share beyond its ends, so that no ray slips between two that meet."""
+"""A segment is longer by this share at each end, so that rounding lets no ray pass between two that meet."""
 
 
 def cast_segments(origin: tuple[float, float], directions: FloatArray, segments: FloatArray) -> FloatArray:
-    """Distances (N,) from ``origin`` along ``directions`` (N, 2) to the nearest of ``segments`` (M, 4); inf: none.
+    """Compute the distances along rays to the nearest segment.
 
-    Segments are x0, y0, x1, y1 in metres; their ends belong to them. One that a ray runs along is not met.
+    Args:
+        origin: Where all rays begin: x, y (m).
+        directions: Their unit vectors (N, 2).
+        segments: (M, 4) as x0, y0, x1, y1 (m); the ends belong to them.
+
+    Returns:
+        Distances (N,) in m; inf where a ray meets no segment. Segments parallel to a ray are not met.
+
     """
     if not len(segments):
         return np.full(len(directions), np.inf)
@@ -30,9 +37,16 @@ def cast_segments(origin: tuple[float, float], directions: FloatArray, segments:
 
 
 def cast_ellipses(origin: tuple[float, float], directions: FloatArray, ellipses: FloatArray) -> FloatArray:
-    """As cast_segments, to the nearest of ``ellipses`` (M, 5): centre x, y, theta, and the semi-axes along it.
+    """Compute the distances along rays to the nearest ellipse.
 
-    From inside an ellipse it is the distance to its outline.
+    Args:
+        origin: Where all rays begin: x, y (m).
+        directions: Their unit vectors (N, 2).
+        ellipses: (M, 5) as centre x, y (m), theta (rad), semi-axis along theta, semi-axis across (m).
+
+    Returns:
+        Distances (N,) in m; inf where a ray meets no ellipse. From inside an ellipse, the distance to its outline.
+
     """
     if not len(ellipses):
         return np.full(len(directions), np.inf)

@@ -1,10 +1,11 @@
-"""One scan of a 2D LiDAR, and the pieces of it that were taken from different poses."""
+"""One scan of a 2D LiDAR: what its ranges mean, and how it is cut where the laser moved while it was taken."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from enum import IntEnum
 from functools import lru_cache
 from itertools import pairwise
 
@@ -15,12 +16,49 @@ from prim.arrays import FloatArray
 from prim.se2 import Pose2D, wrap_angle
 
 
+class RangeOutcome(IntEnum):
+    """What became of one beam, by REP 117 (Fixed Distance Range Sensor Conventions) and sensor_msgs/LaserScan.
+
+    ============  =======================================  ====================================================
+    outcome       range z                                  meaning
+    ============  =======================================  ====================================================
+    MEASURED      range_min <= z < range_max, and z > 0    the distance to a surface
+    TOO_NEAR      -inf                                     a surface nearer than range_min
+    NO_RETURN     z >= range_max, +inf among them          no surface up to range_max
+    INVALID       NaN; finite, but below range_min or <= 0  no measurement; REP 117 calls such numbers erroneous
+    ============  =======================================  ====================================================
+
+    TOO_NEAR and NO_RETURN are censored measurements: mappers with an inverse sensor model skip the former, forward
+    models take both by the probability of the tail.
+    """
+
+    MEASURED = 0
+    TOO_NEAR = 1
+    NO_RETURN = 2
+    INVALID = 3
+
+
+_MEASURED, _TOO_NEAR, _NO_RETURN, _INVALID = (np.int8(outcome) for outcome in RangeOutcome)
+
+
 @dataclass(frozen=True, slots=True)
 class Scan:
-    """One turn of a LiDAR: ``ranges`` (N,) in metres at bearings angle_min + i * angle_increment (rad).
+    """One sweep of a LiDAR, or a part of one, with the fields of sensor_msgs/LaserScan.
 
-    Follows sensor_msgs/LaserScan and REP 117: +inf is no return, -inf a return nearer than ``range_min``, NaN
-    no measurement. A part of a turn says which of the turn's beams is its ``first_beam``.
+    :class:`RangeOutcome` defines what a range means.
+
+    Attributes:
+        stamp: Time of the first beam (ns).
+        frame_id: The laser's frame.
+        angle_min: Bearing of the first beam (rad).
+        angle_increment: From one beam's bearing to the next one's (rad).
+        range_min: The shortest range that can be measured (m).
+        range_max: The longest one (m).
+        ranges: (N,) m.
+        time_increment: From one beam to the next (s).
+        scan_time: From one scan to the next (s).
+        first_beam: Which beam of the sweep the first one is: not 0 in a part of a sweep.
+
     """
 
     stamp: int
@@ -36,7 +74,7 @@ class Scan:
 
     @property
     def problem(self) -> str | None:
-        """What makes the whole scan unusable, None where nothing does."""
+        """What makes the whole scan unusable; None where nothing does."""
         if not np.isfinite((self.angle_min, self.angle_increment, self.range_min)).all():
             angles = f"angle_min {self.angle_min:g}, angle_increment {self.angle_increment:g}"
             return f"{angles}, range_min {self.range_min:g}"
@@ -49,33 +87,71 @@ class Scan:
         """Unit vectors (N, 2) of the beams in the laser's frame; shared and read-only."""
         return beam_directions(self.angle_min, self.angle_increment, len(self.ranges))
 
+    def outcomes(self) -> NDArray[np.int8]:
+        """Classify each range (N,) by :class:`RangeOutcome`; limits are compared in the ranges' own precision."""
+        z = self.ranges
+        valid = (z >= self.range_min) & (z > 0)
+        outcomes = np.where(valid, _MEASURED, _INVALID)
+        outcomes[valid & (z >= self.range_max)] = _NO_RETURN
+        outcomes[z == -np.inf] = _TOO_NEAR
+        return outcomes
+
     @property
-    def hits(self) -> NDArray[np.bool_]:
-        """Which beams returned from a surface: range_min <= range < range_max and positive."""
-        return (self.ranges >= self.range_min) & (self.ranges > 0) & (self.ranges < self.range_max)
+    def measured(self) -> NDArray[np.bool_]:
+        """Which beams (N,) measured the distance to a surface."""
+        return np.equal(self.outcomes(), _MEASURED)
+
+    def censored_ranges(self) -> tuple[NDArray[np.bool_], NDArray[np.float32]]:
+        """Select what a forward sensor model is fitted to.
+
+        Returns:
+            Which beams (N,) are used: all but INVALID ones, and TOO_NEAR ones only where range_min > 0 (else nothing
+            can be nearer). Their ranges (M,) in m, with +inf for NO_RETURN and -inf for TOO_NEAR.
+
+        """
+        outcomes = self.outcomes()
+        used = outcomes != _INVALID
+        if self.range_min <= 0:
+            used &= outcomes != _TOO_NEAR
+        ranges = np.where(outcomes == _NO_RETURN, np.float32(np.inf), self.ranges)
+        return used, ranges[used]
 
     def points(self, pose: Pose2D) -> FloatArray:
-        """End points (M, 2) of the beams that hit, in the frame that ``pose`` (of the laser) is given in."""
-        hits = self.hits
-        return pose.apply(self.directions[hits] * self.ranges[hits, None].astype(float))
+        """Return the end points (M, 2) of the measured beams, in the parent frame of the laser's ``pose`` (m)."""
+        measured = self.measured
+        return pose.apply(self.directions[measured] * self.ranges[measured, None].astype(float))
 
 
 @lru_cache(maxsize=64)
 def beam_directions(angle_min: float, angle_increment: float, count: int) -> FloatArray:
-    """Unit vectors (count, 2) at bearings angle_min + i * angle_increment; cached and read-only."""
+    """Compute the unit vectors of a scanner's beams; cached.
+
+    Args:
+        angle_min: Bearing of the first beam (rad).
+        angle_increment: From one beam's bearing to the next one's (rad).
+        count: The number of beams.
+
+    Returns:
+        Unit vectors (count, 2) in the laser's frame, read-only.
+
+    """
     bearings = angle_min + angle_increment * np.arange(count)
     directions = np.column_stack((np.cos(bearings), np.sin(bearings)))
     directions.flags.writeable = False
     return directions
 
 
-MOST_PIECES = 64
-"""A scan whose laser moves meanwhile is cut into no more pieces."""
-
-
 @dataclass(frozen=True)
 class PosedScan:
-    """A scan, the laser's pose at its first beam, and the same in ``pieces`` that have a pose of their own each."""
+    """A scan with the laser's pose.
+
+    Attributes:
+        position: The scan's index among those of the log.
+        scan: The whole scan.
+        pose: The laser's pose in the map frame at the first beam.
+        pieces: The scan in parts, each with the laser's pose while it was taken (see :func:`deskew`).
+
+    """
 
     position: int
     scan: Scan
@@ -84,22 +160,35 @@ class PosedScan:
 
     @property
     def points(self) -> FloatArray:
-        """End points (M, 2) in the map frame of the beams that hit."""
+        """End points (M, 2) of the measured beams in the map frame (m)."""
         return np.concatenate([scan.points(pose) for scan, pose in self.pieces])
 
 
-def pieces_of(scan: Scan, pose: Pose2D, end: Pose2D | None, tolerance: float) -> list[tuple[Scan, Pose2D]]:
-    """A scan cut so that each piece's beams are seen from where the laser then was.
+def deskew(
+    scan: Scan, pose: Pose2D, end: Pose2D | None, tolerance: float, max_pieces: int = 64
+) -> list[tuple[Scan, Pose2D]]:
+    """Compensate for the laser's motion during a scan by cutting the scan into pieces with a pose each.
 
-    ``end`` is the laser's pose at the last beam, None where it did not move. In between it moves evenly; within a
-    piece, it moves what it sees by no more than ``tolerance`` (m), unless there were more than MOST_PIECES pieces.
+    The motion from ``pose`` to ``end`` is taken to be uniform.
+
+    Args:
+        scan: The scan.
+        pose: The laser's pose at the first beam.
+        end: The laser's pose at the last beam; None where it did not move.
+        tolerance: How far the motion may displace a measured point within one piece (m).
+        max_pieces: The number of pieces that is not exceeded, even where the tolerance then is.
+
+    Returns:
+        The pieces in the order of their beams, each with the pose at its middle beam. One piece, ``scan`` at
+        ``pose``, where the motion is within the tolerance.
+
     """
     if end is None:
         return [(scan, pose)]
     dx, dy, turn = end.x - pose.x, end.y - pose.y, wrap_angle(end.theta - pose.theta)
-    hits = scan.ranges[scan.hits]
-    reach = float(hits.max()) if len(hits) else 0.0
-    count = min(math.ceil((math.hypot(dx, dy) + abs(turn) * reach) / tolerance), MOST_PIECES, len(scan.ranges))
+    measured = scan.ranges[scan.measured]
+    reach = float(measured.max()) if len(measured) else 0.0
+    count = min(math.ceil((math.hypot(dx, dy) + abs(turn) * reach) / tolerance), max_pieces, len(scan.ranges))
     if count <= 1:
         return [(scan, pose)]
     edges = np.linspace(0, len(scan.ranges), count + 1).astype(int).tolist()
@@ -119,6 +208,6 @@ def pieces_of(scan: Scan, pose: Pose2D, end: Pose2D | None, tolerance: float) ->
     return pieces
 
 
-def turned_over(scan: Scan) -> Scan:
-    """The scan of a laser that is mounted upside down, as seen from above."""
+def mirror_scan(scan: Scan) -> Scan:
+    """Return the scan of a laser that is mounted upside down as one that is not would have taken it."""
     return replace(scan, angle_min=-scan.angle_min, angle_increment=-scan.angle_increment)

@@ -1,4 +1,11 @@
-"""Poses, trajectories and scans (metres, radians, nanosecond stamps; x forward, y left)."""
+"""Rigid motions of the plane, SE(2): poses, their composition, their covariances, trajectories.
+
+A pose (x, y, theta) is the position and orientation of a frame in its parent: metres and radians, x forward, y left,
+theta counter-clockwise (REP 103). It maps a point p of the frame to R(theta) p + (x, y) in the parent. One pose is a
+:class:`Pose2D`; many are an array (N, 3). Covariances are of (x, y, theta) with the errors of all three given in the
+parent's axes, and are carried to first order (Smith, Self and Cheeseman, «Estimating uncertain spatial relationships
+in robotics», 1990).
+"""
 
 from __future__ import annotations
 
@@ -14,7 +21,7 @@ from prim.arrays import FloatArray, Stamps
 
 @dataclass(frozen=True, slots=True)
 class Pose2D:
-    """Where a frame stands in its parent: x, y (m), theta (rad) and, where known, their 3 x 3 covariance."""
+    """A frame's pose in its parent: x, y (m), theta (rad) and, where known, their 3 x 3 covariance."""
 
     x: float = 0.0
     y: float = 0.0
@@ -22,7 +29,10 @@ class Pose2D:
     covariance: FloatArray | None = None
 
     def __matmul__(self, child: Pose2D) -> Pose2D:
-        """The child's pose, given in this frame, in this frame's parent; independent covariances add up."""
+        """Compose two poses: ``child``, given in this frame, in this frame's parent.
+
+        The heading is wrapped. Covariances are taken as independent and add up; one that is None counts as zero.
+        """
         cos, sin = math.cos(self.theta), math.sin(self.theta)
         dx, dy = cos * child.x - sin * child.y, sin * child.x + cos * child.y
         return Pose2D(
@@ -45,23 +55,28 @@ class Pose2D:
         return total
 
     def inverse(self) -> Pose2D:
-        """The parent's pose in this frame (without covariance)."""
+        """Return the parent's pose in this frame, without covariance."""
         cos, sin = math.cos(self.theta), math.sin(self.theta)
         return Pose2D(-cos * self.x - sin * self.y, sin * self.x - cos * self.y, -self.theta)
 
     def apply(self, points: ArrayLike) -> FloatArray:
-        """Points (N, 2) of this frame in the parent frame."""
-        cos, sin = math.cos(self.theta), math.sin(self.theta)
-        moved: FloatArray = np.asarray(points) @ np.array([[cos, sin], [-sin, cos]])
+        """Return points (N, 2) of this frame in the parent frame (m)."""
+        moved = rotate(points, self.theta)
         moved += self.x, self.y
         return moved
 
 
 @dataclass(frozen=True, slots=True)
 class Trajectory:
-    """Poses over time: ``stamps`` (N,) ns, strictly rising; ``poses`` (N, 3) as x, y, theta.
+    """Poses over time.
 
-    Raises ValueError on shapes that do not fit or stamps that do not rise.
+    Attributes:
+        stamps: (N,) ns, strictly rising.
+        poses: (N, 3) as x, y (m), theta (rad).
+
+    Raises:
+        ValueError: The shapes do not fit, or the stamps do not rise.
+
     """
 
     stamps: Stamps
@@ -81,7 +96,16 @@ class Trajectory:
 
     @classmethod
     def from_unsorted(cls, stamps: ArrayLike, poses: ArrayLike) -> Trajectory:
-        """Sorts by stamp and, of poses with the same stamp, keeps the one that came last."""
+        """Sort poses by stamp; of those with the same stamp the last one remains.
+
+        Args:
+            stamps: (N,) ns.
+            poses: (N, 3) as x, y (m), theta (rad).
+
+        Returns:
+            The trajectory, of at most N poses.
+
+        """
         raw_stamps = np.asarray(stamps, dtype=np.int64)
         raw_poses = np.asarray(poses, dtype=float).reshape(-1, 3)
         order = np.argsort(raw_stamps, kind="stable")
@@ -90,9 +114,15 @@ class Trajectory:
         return cls(rising[last], raw_poses[order][last])
 
     def at(self, stamps: Stamps) -> tuple[FloatArray, NDArray[np.bool_]]:
-        """Interpolated poses (M, 3) at ``stamps`` (M,), and which of them lie within the trajectory's time.
+        """Interpolate poses linearly, headings along the shorter arc.
 
-        Angles turn the short way. Outside the trajectory's time the nearest end is given, marked False.
+        Args:
+            stamps: (M,) ns.
+
+        Returns:
+            Poses (M, 3), and which stamps (M,) lie within the trajectory's time; outside of it the pose is that of
+            the nearer end.
+
         """
         after = np.clip(np.searchsorted(self.stamps, stamps), 1, max(len(self) - 1, 1))
         before = after - 1
@@ -107,10 +137,123 @@ class Trajectory:
 
 
 def wrap_angle(angle: float) -> float:
-    """The angle (rad) in [-pi, pi)."""
+    """Return the angle (rad) in [-pi, pi)."""
     return (angle + math.pi) % (2 * math.pi) - math.pi
 
 
 def wrap_angles(angles: FloatArray) -> FloatArray:
-    """Angles (rad) in [-pi, pi)."""
+    """Return angles (rad) in [-pi, pi)."""
     return (angles + np.pi) % (2 * np.pi) - np.pi
+
+
+def rotate(points: ArrayLike, theta: float) -> FloatArray:
+    """Rotate points about the origin, counter-clockwise.
+
+    Args:
+        points: (N, 2), any unit.
+        theta: The angle (rad).
+
+    Returns:
+        The rotated points (N, 2), a new array.
+
+    """
+    cos, sin = math.cos(theta), math.sin(theta)
+    rotated: FloatArray = np.asarray(points) @ np.array([[cos, sin], [-sin, cos]])
+    return rotated
+
+
+def compose_poses(poses: FloatArray, children: FloatArray) -> FloatArray:
+    """Compose poses pairwise, as ``Pose2D.__matmul__`` but with headings that are not wrapped.
+
+    Args:
+        poses: (N, 3) of frames.
+        children: (N, 3), each given in the frame of the pose with the same index (an extrinsic calibration, a mount).
+
+    Returns:
+        The children's poses (N, 3) in the parent of ``poses``.
+
+    """
+    cos, sin = np.cos(poses[:, 2]), np.sin(poses[:, 2])
+    x = poses[:, 0] + cos * children[:, 0] - sin * children[:, 1]
+    y = poses[:, 1] + sin * children[:, 0] + cos * children[:, 1]
+    return np.column_stack((x, y, poses[:, 2] + children[:, 2]))
+
+
+def relative_poses(poses: FloatArray, others: FloatArray) -> FloatArray:
+    """Compute poses relative to others, pairwise: the inverse of :func:`compose_poses`, with headings wrapped.
+
+    Args:
+        poses: (N, 3) of the frames to refer to.
+        others: (N, 3) in the same parent.
+
+    Returns:
+        ``others`` (N, 3) in the frames of ``poses``.
+
+    """
+    change = others - poses
+    cos, sin = np.cos(poses[:, 2]), np.sin(poses[:, 2])
+    x, y = cos * change[:, 0] + sin * change[:, 1], cos * change[:, 1] - sin * change[:, 0]
+    return np.column_stack((x, y, wrap_angles(change[:, 2])))
+
+
+def relative_steps(poses: FloatArray) -> FloatArray:
+    """Compute each pose (N, 3) relative to the one before it; the first row is zero."""
+    steps = np.zeros_like(poses)
+    steps[1:] = relative_poses(poses[:-1], poses[1:])
+    return steps
+
+
+def integrate_steps(steps: FloatArray, start: FloatArray | None = None) -> FloatArray:
+    """Chain relative poses (dead reckoning): the inverse of :func:`relative_steps`.
+
+    Args:
+        steps: (N, 3), each relative to the pose before it; the first to ``start``.
+        start: The pose (3,) before the first step; None: the origin.
+
+    Returns:
+        The poses (N, 3) after each step, with headings that are not wrapped.
+
+    """
+    x, y, theta = np.zeros(3) if start is None else start
+    heading = theta + np.cumsum(steps[:, 2])
+    before = np.concatenate(([theta], heading[:-1]))
+    cos, sin = np.cos(before), np.sin(before)
+    dx, dy = cos * steps[:, 0] - sin * steps[:, 1], sin * steps[:, 0] + cos * steps[:, 1]
+    return np.column_stack((x + np.cumsum(dx), y + np.cumsum(dy), heading))
+
+
+def compose_covariances(covariances: FloatArray, poses: FloatArray, children: FloatArray) -> FloatArray:
+    """Carry covariances of poses over to frames that are mounted on them without error.
+
+    Args:
+        covariances: (N, 3, 3) of ``poses``.
+        poses: (N, 3).
+        children: (N, 3), each given in the frame of the pose with the same index.
+
+    Returns:
+        The covariances (N, 3, 3) of ``compose_poses(poses, children)``.
+
+    """
+    cos, sin = np.cos(poses[:, 2]), np.sin(poses[:, 2])
+    jacobian = np.broadcast_to(np.eye(3), (len(poses), 3, 3)).copy()
+    jacobian[:, 0, 2] = -(sin * children[:, 0] + cos * children[:, 1])
+    jacobian[:, 1, 2] = cos * children[:, 0] - sin * children[:, 1]
+    carried: FloatArray = jacobian @ covariances @ jacobian.transpose(0, 2, 1)
+    return carried
+
+
+def frame_covariances(covariance: FloatArray, poses: FloatArray) -> FloatArray:
+    """Compute what an uncertain frame adds to the covariances of poses that are given in it.
+
+    Args:
+        covariance: (3, 3) of the frame's own pose, its errors given at the frame's origin and in its axes.
+        poses: (N, 3) in the frame.
+
+    Returns:
+        The covariances (N, 3, 3) of the poses that come of the frame's error alone.
+
+    """
+    jacobian = np.broadcast_to(np.eye(3), (len(poses), 3, 3)).copy()
+    jacobian[:, 0, 2], jacobian[:, 1, 2] = -poses[:, 1], poses[:, 0]
+    added: FloatArray = jacobian @ covariance @ jacobian.transpose(0, 2, 1)
+    return added

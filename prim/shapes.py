@@ -200,9 +200,18 @@ def _moments(vertices: FloatArray) -> tuple[float, float, float]:
 
 @dataclass(frozen=True, slots=True)
 class Primitive:
-    """One primitive: its kind, area centroid (m), heading (rad, None for a circle) and sizes (m).
+    """One primitive.
 
-    Raises ValueError where the sizes do not fit the kind, or a value is not finite or not positive.
+    Attributes:
+        kind: Its kind.
+        x: The area centroid's x in the map frame (m).
+        y: The area centroid's y in the map frame (m).
+        theta: Its heading (rad); None where the kind has none.
+        size: Its sizes (m), in the order of the kind's row.
+
+    Raises:
+        ValueError: The sizes or the heading do not fit the kind, or a value is not finite, or a size not positive.
+
     """
 
     kind: Kind
@@ -245,21 +254,21 @@ class Primitive:
 
     @property
     def circumradius(self) -> float:
-        """How far (m) the outline reaches from the centroid."""
+        """The largest distance of the outline from the centroid (m)."""
         if self.is_round:
             return max(self.width_height)
         return float(np.hypot(*self.local_outline().T).max())
 
     @property
     def sides(self) -> tuple[float, ...]:
-        """The lengths (m) of the outline's edges; of a round shape both semi-axes."""
+        """Lengths of the outline's edges (m); of a round shape, both semi-axes."""
         if self.is_round:
             return self.width_height
         corners = self.local_outline()
         return tuple(np.hypot(*(np.roll(corners, -1, axis=0) - corners).T).tolist())
 
     def sides_agree(self, share: float) -> bool:
-        """Whether all sides are the same to within a share of the longest one."""
+        """Return whether all sides are the same to within ``share`` of the longest one."""
         return max(self.sides) - min(self.sides) <= share * max(self.sides)
 
     @property
@@ -272,7 +281,7 @@ class Primitive:
         return self.kind.row.regular_period if self.sides_agree(SIDES_AGREE) else self.kind.row.period
 
     def canonical(self) -> Primitive:
-        """The same shape with the longer side first (rectangle, ellipse) and theta in its kind's range."""
+        """Return the same shape with the longer side first (rectangle, ellipse) and theta in its kind's range."""
         period = self.kind.row.period
         if self.theta is None or period is None:
             return self
@@ -283,12 +292,12 @@ class Primitive:
         return replace(self, theta=0.0 if theta >= period else theta, size=size)
 
     def local_outline(self, points: int = OUTLINE_POINTS) -> FloatArray:
-        """Counter-clockwise vertices in the shape's own frame, (N, 2) in metres, the first not repeated."""
+        """Return the outline's vertices (N, 2) in the shape's frame (m), counter-clockwise; round ones ``points``."""
         vertices = _round_vertices(points) if self.is_round else self.kind.vertices
         return np.asarray(vertices * self.width_height)
 
     def outline(self, points: int = OUTLINE_POINTS) -> FloatArray:
-        """Counter-clockwise vertices in the map frame, (N, 2) in metres, the first not repeated."""
+        """Return the outline's vertices (N, 2) in the map frame (m), counter-clockwise; round ones ``points``."""
         cos, sin = math.cos(self.theta or 0.0), math.sin(self.theta or 0.0)
         outline: FloatArray = self.local_outline(points) @ np.array([[cos, sin], [-sin, cos]])
         outline += self.x, self.y
@@ -300,30 +309,36 @@ class Primitive:
         return self.kind.is_round
 
     def cast(self, origin: tuple[float, float], directions: FloatArray) -> FloatArray:
-        """Exact distances (m) from ``origin`` along unit ``directions`` (N, 2), map frame; inf for a miss.
+        """Compute exact distances along rays to the outline.
 
-        From inside the shape it is the distance to its outline.
+        Args:
+            origin: Where all rays begin: x, y in the map frame (m).
+            directions: Their unit vectors (N, 2).
+
+        Returns:
+            Distances (N,) in m; inf where a ray misses. From inside the shape, the distance to its outline.
+
         """
         if self.is_round:
             return cast_ellipses(origin, directions, np.array([self.as_ellipse()]))
         return cast_segments(origin, directions, self.as_segments())
 
     def as_ellipse(self) -> tuple[float, float, float, float, float]:
-        """A round shape as :func:`prim.raycast.cast_ellipses` takes it."""
+        """Return a round shape as a row for :func:`prim.raycast.cast_ellipses`."""
         return self.x, self.y, self.theta or 0.0, *self.width_height
 
     def as_segments(self) -> FloatArray:
-        """The edges (M, 4) of a shape with corners as :func:`prim.raycast.cast_segments` takes them."""
+        """Return the edges (M, 4) of a shape with corners for :func:`prim.raycast.cast_segments`."""
         corners = self.outline()
         return np.hstack((corners, np.roll(corners, -1, axis=0)))
 
     def to_json(self) -> dict[str, Any]:
-        """As reports and ``world.json`` hold it."""
+        """Return the primitive as reports and ``world.json`` hold it."""
         return {"kind": str(self.kind), "x": self.x, "y": self.y, "theta": self.theta, "size": self.sizes}
 
     @classmethod
     def from_json(cls, value: Mapping[str, Any]) -> Primitive:
-        """The inverse of :meth:`to_json`. Raises ValueError that names what is wrong."""
+        """Invert :meth:`to_json`. Raises ValueError that names what is wrong."""
         if not isinstance(value, Mapping):
             raise ValueError(f"{json.dumps(value)} does not describe a primitive")
         try:

@@ -1,4 +1,4 @@
-"""The exact truth of a recorded session: primitives and walls, and what a perfect beam would measure."""
+"""The ground truth of a recorded session: primitives and walls, and what a beam without noise measures."""
 
 from __future__ import annotations
 
@@ -26,7 +26,14 @@ Bounds = tuple[float, float, float, float]
 
 @dataclass(frozen=True)
 class World:
-    """Primitives and thin walls on a floor of ``size`` (m along x and y), centred on the map's origin."""
+    """Primitives and thin walls on a rectangular floor, in the map frame.
+
+    Attributes:
+        size: The floor, along x and y (m), centred on the origin.
+        primitives: The primitives.
+        walls: The walls.
+
+    """
 
     size: tuple[float, float]
     primitives: tuple[Primitive, ...] = ()
@@ -38,13 +45,22 @@ class World:
         width, height = self.size
         return -width / 2, -height / 2, width / 2, height / 2
 
-    def walled(self) -> World:
-        """The same world with a wall along each edge of the floor."""
+    def with_walls(self) -> World:
+        """Return the same world with a wall along each edge of the floor, and no others."""
         x0, y0, x1, y1 = self.bounds
         return replace(self, walls=((x0, y0, x1, y0), (x1, y0, x1, y1), (x1, y1, x0, y1), (x0, y1, x0, y0)))
 
     def cast(self, origin: tuple[float, float], directions: FloatArray) -> FloatArray:
-        """Exact distances (m) to the nearest surface along unit ``directions`` (N, 2); inf where there is none."""
+        """Compute exact distances along rays to the nearest surface.
+
+        Args:
+            origin: Where all rays begin: x, y (m).
+            directions: Their unit vectors (N, 2).
+
+        Returns:
+            Distances (N,) in m; inf where there is no surface.
+
+        """
         flat = cast_segments(origin, directions, self._segments)
         return np.minimum(flat, cast_ellipses(origin, directions, self._ellipses))
 
@@ -59,7 +75,7 @@ class World:
         return np.asarray(rounds, dtype=float).reshape(-1, 5)
 
     def to_json(self) -> dict[str, Any]:
-        """As the log's attachment ``world.json`` holds it."""
+        """Return the world as the log's attachment ``world.json`` holds it."""
         return {
             "size": list(self.size),
             "walls": [list(wall) for wall in self.walls],
@@ -68,7 +84,7 @@ class World:
 
     @classmethod
     def from_json(cls, value: Mapping[str, Any]) -> World:
-        """The inverse of :meth:`to_json`. Raises ValueError that names what is wrong."""
+        """Invert :meth:`to_json`. Raises ValueError that names what is wrong."""
         if not isinstance(value, Mapping) or "size" not in value:
             raise ValueError("a world is an object with 'size', 'primitives' and 'walls'")
         size = _numbers(value["size"], 2, "size")
@@ -80,7 +96,7 @@ class World:
 
     @classmethod
     def load(cls, path: Path) -> World:
-        """Reads a world from a JSON file. Raises WorldError."""
+        """Read a world from a JSON file. Raises WorldError."""
         try:
             return cls.from_json(json.loads(path.read_text(encoding="utf-8")))
         except (UnicodeDecodeError, json.JSONDecodeError) as error:

@@ -12,22 +12,74 @@ import numpy as np
 from prim.errors import UsageError
 from prim.se2 import Pose2D, wrap_angle
 from prim.world import World
-from recorder.simulator import AXLE, ROBOT_RADIUS, Simulator
+from recorder.simulator import Simulator
+
+Cell = tuple[int, int]
+"""Row and column of a cell of the explorer's grid."""
 
 
 @dataclass(frozen=True)
 class Step:
-    """One moment of a session: the robot's true pose, the world as it is, and the way since the last (m)."""
+    """One moment of a session.
+
+    Attributes:
+        pose: The robot's true pose.
+        world: The world as it is then.
+        travelled: How far a wheel has rolled since the step before (m).
+
+    """
 
     pose: Pose2D
     world: World
     travelled: float = 0.0
 
 
-def warp(simulator: Simulator, rng: np.random.Generator, stops: tuple[int, int] = (10, 10)) -> Iterator[Step]:
-    """The paper's supervisor: the robot is put on a regular grid of places (cols, rows), at random headings.
+@dataclass(frozen=True)
+class ExplorerOptions:
+    """How a driving robot explores; all set by hand.
 
-    Places where it would stand inside a primitive or touch one are passed over.
+    Attributes:
+        cell: Side of the cells of the grid in which paths are planned (m).
+        margin: Clearance between the robot's rim and obstacles (m).
+        waypoint_tolerance: A waypoint is reached at this distance (m).
+        explored_radius: Places within this distance of where the robot was count as explored (m).
+        decision_period: Time between two decisions (s).
+        heading_gain: Turn rate for a heading error (1/s).
+        max_turn_rate: Largest turn rate (rad/s).
+        progress: Coming nearer to the waypoint by less than this is no progress (m).
+        patience: Decisions without progress after which the robot backs off and plans anew.
+        back_off_decisions: Decisions for which it backs off.
+        back_off_ratio: The right wheel's speed over the left one's while it backs off.
+
+    """
+
+    cell: float = 0.05
+    margin: float = 0.03
+    waypoint_tolerance: float = 0.06
+    explored_radius: float = 0.25
+    decision_period: float = 0.05
+    heading_gain: float = 4.0
+    max_turn_rate: float = 6.0
+    progress: float = 1e-3
+    patience: int = 40
+    back_off_decisions: int = 15
+    back_off_ratio: float = 0.6
+
+
+DEFAULTS = ExplorerOptions()
+
+
+def warp(simulator: Simulator, rng: np.random.Generator, stops: tuple[int, int] = (10, 10)) -> Iterator[Step]:
+    """Put the robot on a regular grid of places, at random headings (the paper's supervisor).
+
+    Args:
+        simulator: The world and the robot.
+        rng: Draws the headings.
+        stops: Columns and rows of the grid over the floor.
+
+    Yields:
+        A step for each place, row by row; places where the robot would touch a primitive are left out.
+
     """
     x0, y0, x1, y1 = simulator.world.bounds
     cols, rows = stops
@@ -40,57 +92,79 @@ def warp(simulator: Simulator, rng: np.random.Generator, stops: tuple[int, int] 
                 yield Step(pose, simulator.world)
 
 
-def drive(simulator: Simulator, rng: np.random.Generator, period: float, steps: int, speed: float) -> Iterator[Step]:
-    """The robot explores: it drives to a place where it has not been, along a way that keeps off obstacles, again
-    and again. Primitives that can be pushed are no obstacles to it.
+def drive(
+    simulator: Simulator,
+    rng: np.random.Generator,
+    period: float,
+    steps: int,
+    speed: float,
+    options: ExplorerOptions = DEFAULTS,
+) -> Iterator[Step]:
+    """Let the robot explore: time and again it drives to a random place where it has not been, around obstacles.
 
-    ``period`` (s) lies between steps, ``speed`` (m/s) is the largest of a wheel's rim. Raises UsageError where the
-    robot has no room to stand.
+    Primitives that can be pushed are no obstacles to it.
+
+    Args:
+        simulator: The world and the robot.
+        rng: Draws the start and the goals.
+        period: Time between steps (s).
+        steps: The number of steps.
+        speed: Largest rim speed of a wheel (m/s).
+        options: How it explores.
+
+    Yields:
+        The steps; the first one at the start.
+
+    Raises:
+        UsageError: The robot has no room to stand.
+
     """
-    explorer = Explorer(simulator, rng)
+    explorer = Explorer(simulator, rng, options)
     pose = explorer.start()
+    travelled = 0.0
+    substeps = max(1, math.ceil(period / options.decision_period))
     for _ in range(steps):
-        before = pose
-        yield Step(pose, simulator.moved_world(), explorer.travelled)
-        substeps = max(1, math.ceil(period / Explorer.REACTION))
-        explorer.travelled = 0.0
+        yield Step(pose, simulator.current_world(), travelled)
+        travelled = 0.0
         for _ in range(substeps):
-            simulator.drive(*explorer.wheels(simulator.pose, speed), period / substeps)
-            now = simulator.pose
-            turned = abs(wrap_angle(now.theta - before.theta))
-            explorer.travelled += math.hypot(now.x - before.x, now.y - before.y) + turned * AXLE / 2
-            before = now
-        pose = before
+            before = pose
+            simulator.drive(*explorer.wheel_speeds(simulator.pose, speed), period / substeps)
+            pose = simulator.pose
+            turned = abs(wrap_angle(pose.theta - before.theta))
+            travelled += math.hypot(pose.x - before.x, pose.y - before.y) + turned * simulator.options.axle / 2
 
 
 class Explorer:
-    """Chooses where to drive, and the wheels' speeds that lead there."""
+    """Chooses where to drive, and the wheels' speeds that lead there.
 
-    CELL = 0.05
-    MARGIN = 0.03
-    """The robot's rim keeps this far (m) from obstacles."""
-    NEAR = 0.06
-    """A waypoint is reached at this distance (m)."""
-    SEEN = 0.25
-    """Places within this distance (m) of where the robot was count as explored."""
-    REACTION = 0.05
-    """Seconds between two decisions."""
-    PATIENCE = 40
-    """Decisions without headway after which the robot backs off and goes elsewhere."""
+    It plans on a grid of the floor: to a random cell that the robot has not come near to, by a shortest path over
+    cells where the robot keeps clear of all that cannot be moved.
 
-    def __init__(self, simulator: Simulator, rng: np.random.Generator) -> None:
+    Args:
+        simulator: The world and the robot.
+        rng: Draws the start and the goals.
+        options: How it explores.
+
+    """
+
+    def __init__(self, simulator: Simulator, rng: np.random.Generator, options: ExplorerOptions = DEFAULTS) -> None:
         self._simulator = simulator
         self._rng = rng
-        self._way: deque[tuple[float, float]] = deque()
+        self._options = options
+        self._path: deque[tuple[float, float]] = deque()
         self._free = self._free_cells()
-        self._unseen: set[tuple[int, int]] = set()
-        self._best = math.inf
+        self._unexplored: set[Cell] = set()
+        self._nearest = math.inf
         self._stuck = 0
-        self.travelled = 0.0
 
     def start(self) -> Pose2D:
-        """Puts the robot somewhere, on the largest free area."""
-        self._free = _largest_area(self._free)
+        """Put the robot at a random place of the largest connected free area, and return its pose.
+
+        Raises:
+            UsageError: There is no such place.
+
+        """
+        self._free = _largest_component(self._free)
         if not self._free:
             raise UsageError("the robot finds no room to drive: give a larger --size or fewer primitives")
         cells = sorted(self._free)
@@ -100,104 +174,120 @@ class Explorer:
                 return pose
         raise UsageError("the robot finds no room to stand: every place is taken by a primitive")
 
-    def wheels(self, pose: Pose2D, speed: float) -> tuple[float, float]:
-        """Rim speeds (m/s) of the left and the right wheel, from where the robot is now."""
-        self._unseen -= self._around(pose)
-        if self._stuck > self.PATIENCE:
+    def wheel_speeds(self, pose: Pose2D, speed: float) -> tuple[float, float]:
+        """Decide on the wheels' speeds: turn towards the next waypoint, and go ahead as far as it lies ahead.
+
+        Args:
+            pose: Where the robot is.
+            speed: Largest rim speed (m/s).
+
+        Returns:
+            Rim speeds (m/s) of the left and the right wheel.
+
+        """
+        options = self._options
+        self._unexplored -= self._around(pose)
+        if self._stuck > options.patience:
             return self._back_off(speed)
-        while self._way and math.hypot(self._way[0][0] - pose.x, self._way[0][1] - pose.y) < self.NEAR:
-            self._way.popleft()
-            self._best = math.inf
-        if not self._way:
+        while self._path and math.hypot(self._path[0][0] - pose.x, self._path[0][1] - pose.y) < (
+            options.waypoint_tolerance
+        ):
+            self._path.popleft()
+            self._nearest = math.inf
+        if not self._path:
             self._plan(pose)
-        x, y = self._way[0] if self._way else (pose.x, pose.y)
-        self._watch_headway(math.hypot(x - pose.x, y - pose.y))
+        x, y = self._path[0] if self._path else (pose.x, pose.y)
+        self._watch_progress(math.hypot(x - pose.x, y - pose.y))
         error = wrap_angle(math.atan2(y - pose.y, x - pose.x) - pose.theta)
-        turn = min(max(4.0 * error, -6.0), 6.0) * AXLE / 2
+        rate = min(max(options.heading_gain * error, -options.max_turn_rate), options.max_turn_rate)
+        turn = rate * self._simulator.options.axle / 2
         ahead = speed * max(0.0, math.cos(error)) ** 2
         largest = max(abs(ahead - turn), abs(ahead + turn), speed)
         return (ahead - turn) * speed / largest, (ahead + turn) * speed / largest
 
-    def _watch_headway(self, distance: float) -> None:
-        if distance < self._best - 1e-3:
-            self._best, self._stuck = distance, 0
+    def _watch_progress(self, distance: float) -> None:
+        if distance < self._nearest - self._options.progress:
+            self._nearest, self._stuck = distance, 0
         else:
             self._stuck += 1
 
     def _back_off(self, speed: float) -> tuple[float, float]:
         self._stuck += 1
-        if self._stuck > self.PATIENCE + 15:
-            self._stuck, self._best = 0, math.inf
-            self._way.clear()
-        return -speed, -0.6 * speed
+        if self._stuck > self._options.patience + self._options.back_off_decisions:
+            self._stuck, self._nearest = 0, math.inf
+            self._path.clear()
+        return -speed, -self._options.back_off_ratio * speed
 
     def _plan(self, pose: Pose2D) -> None:
-        """The shortest way over free cells to a random one that has not been seen."""
+        """Find a shortest path over free cells to a random unexplored one; to any free cell once all are explored."""
         here = min(self._free, key=lambda cell: math.dist(self._centre(cell), (pose.x, pose.y)))
-        if not self._unseen:
-            self._unseen = self._free - self._around(pose)
-        goals = sorted(self._unseen or self._free)
+        if not self._unexplored:
+            self._unexplored = self._free - self._around(pose)
+        goals = sorted(self._unexplored or self._free)
         goal = goals[self._rng.integers(len(goals))]
-        self._way = deque(self._centre(cell) for cell in _shortest(self._free, here, goal))
-        self._best, self._stuck = math.inf, 0
+        self._path = deque(self._centre(cell) for cell in _shortest_path(self._free, here, goal))
+        self._nearest, self._stuck = math.inf, 0
 
-    def _around(self, pose: Pose2D) -> set[tuple[int, int]]:
-        reach = round(self.SEEN / self.CELL)
-        row, col = math.floor(pose.y / self.CELL), math.floor(pose.x / self.CELL)
+    def _around(self, pose: Pose2D) -> set[Cell]:
+        """Return the cells that count as explored from ``pose``."""
+        cell = self._options.cell
+        reach = round(self._options.explored_radius / cell)
+        row, col = math.floor(pose.y / cell), math.floor(pose.x / cell)
         spread = range(-reach, reach + 1)
         return {(row + r, col + c) for r in spread for c in spread if r * r + c * c <= reach * reach}
 
-    def _free_cells(self) -> set[tuple[int, int]]:
-        """Cells (row, col) of the floor where the robot keeps off all that stands still."""
+    def _free_cells(self) -> set[Cell]:
+        """Return the cells of the floor where the robot keeps clear of all that cannot be moved."""
         x0, y0, x1, y1 = self._simulator.world.bounds
-        rows = range(math.floor(y0 / self.CELL), math.ceil(y1 / self.CELL))
-        cols = range(math.floor(x0 / self.CELL), math.ceil(x1 / self.CELL))
+        cell = self._options.cell
+        rows = range(math.floor(y0 / cell), math.ceil(y1 / cell))
+        cols = range(math.floor(x0 / cell), math.ceil(x1 / cell))
         return {(row, col) for row in rows for col in cols if self._has_room(*self._centre((row, col)))}
 
     def _has_room(self, x: float, y: float) -> bool:
         x0, y0, x1, y1 = self._simulator.world.bounds
-        room = ROBOT_RADIUS + self.MARGIN
+        room = self._simulator.options.robot_radius + self._options.margin
         on_floor = x0 + room <= x <= x1 - room and y0 + room <= y <= y1 - room
         return on_floor and self._simulator.clearance(x, y, room) >= room
 
-    def _centre(self, cell: tuple[int, int]) -> tuple[float, float]:
-        return (cell[1] + 0.5) * self.CELL, (cell[0] + 0.5) * self.CELL
+    def _centre(self, cell: Cell) -> tuple[float, float]:
+        return (cell[1] + 0.5) * self._options.cell, (cell[0] + 0.5) * self._options.cell
 
 
-def _neighbours(cell: tuple[int, int]) -> list[tuple[int, int]]:
+def _neighbours(cell: Cell) -> list[Cell]:
     row, col = cell
     return [(row + 1, col), (row - 1, col), (row, col + 1), (row, col - 1)]
 
 
-def _largest_area(cells: set[tuple[int, int]]) -> set[tuple[int, int]]:
-    """The largest connected part of the cells."""
-    left, largest = set(cells), set[tuple[int, int]]()
+def _largest_component(cells: set[Cell]) -> set[Cell]:
+    """Return the largest 4-connected component of the cells."""
+    left, largest = set(cells), set[Cell]()
     while left:
-        area = set(_reach(left, min(left)))
-        left -= area
-        largest = max(largest, area, key=len)
+        component = set(_predecessors(left, min(left)))
+        left -= component
+        largest = max(largest, component, key=len)
     return largest
 
 
-def _reach(cells: set[tuple[int, int]], start: tuple[int, int]) -> dict[tuple[int, int], tuple[int, int]]:
-    """All cells that can be reached from ``start``, each with the one before it on a shortest way."""
-    came_from = {start: start}
+def _predecessors(cells: set[Cell], start: Cell) -> dict[Cell, Cell]:
+    """Search breadth-first: all cells that can be reached from ``start``, each with the one before it on the path."""
+    predecessors = {start: start}
     queue = deque([start])
     while queue:
         cell = queue.popleft()
         for other in _neighbours(cell):
-            if other in cells and other not in came_from:
-                came_from[other] = cell
+            if other in cells and other not in predecessors:
+                predecessors[other] = cell
                 queue.append(other)
-    return came_from
+    return predecessors
 
 
-def _shortest(cells: set[tuple[int, int]], start: tuple[int, int], goal: tuple[int, int]) -> list[tuple[int, int]]:
-    """The corners of a shortest way from ``start`` to ``goal`` (none if there is no way)."""
-    came_from = _reach(cells, start)
-    if goal not in came_from:
+def _shortest_path(cells: set[Cell], start: Cell, goal: Cell) -> list[Cell]:
+    """Return the cells of a shortest path behind ``start`` up to ``goal``; none where there is no path."""
+    predecessors = _predecessors(cells, start)
+    if goal not in predecessors:
         return []
-    way = [goal]
-    while way[-1] != start:
-        way.append(came_from[way[-1]])
-    return way[-2::-1] or [goal]
+    path = [goal]
+    while path[-1] != start:
+        path.append(predecessors[path[-1]])
+    return path[-2::-1] or [goal]

@@ -1,4 +1,4 @@
-"""What the robot believes of its own motion: wheel odometry that drifts."""
+"""The robot's estimate of its own motion: wheel odometry that drifts."""
 
 from __future__ import annotations
 
@@ -12,19 +12,25 @@ from prim.se2 import Pose2D
 
 @dataclass(frozen=True)
 class OdometryNoise:
-    """White noise of wheel odometry: its variances grow with the way travelled.
+    """White noise of wheel odometry, whose variances grow in proportion to the distance travelled.
 
-    ``metres`` and ``radians`` are the standard deviations, along and across alike, after one metre.
+    Attributes:
+        translation_std: Standard deviation of the position, along and across alike, after one metre (m).
+        rotation_std: Standard deviation of the heading after one metre (rad).
+
     """
 
-    metres: float = 0.05
-    radians: float = math.radians(2)
+    translation_std: float = 0.05
+    rotation_std: float = math.radians(2)
 
 
 class Odometry:
-    """Adds up noisy steps from the true start on; the covariance tells how far it may be off.
+    """Dead reckoning from the true start on: the true steps with white noise on x, y and heading.
 
-    The steps are the true ones with white noise on the way forward, on the way aside and on the turn.
+    Args:
+        noise: The noise of a step.
+        rng: Draws it.
+
     """
 
     def __init__(self, noise: OdometryNoise, rng: np.random.Generator) -> None:
@@ -34,12 +40,22 @@ class Odometry:
         self.pose = Pose2D()
 
     def update(self, true_pose: Pose2D, travelled: float) -> Pose2D:
-        """The believed pose after the robot went ``travelled`` metres (of wheel) to ``true_pose``."""
+        """Add a step.
+
+        Args:
+            true_pose: The robot's true pose after it.
+            travelled: How far a wheel rolled during it (m).
+
+        Returns:
+            The pose by odometry, with the covariance of its error.
+
+        """
         if self._true is None:
             self.pose = Pose2D(true_pose.x, true_pose.y, true_pose.theta, np.zeros((3, 3)))
         else:
-            scale = math.sqrt(travelled)
-            std = np.array([self._noise.metres, self._noise.metres, self._noise.radians]) * scale
+            noise = self._noise
+            stds = np.array([noise.translation_std, noise.translation_std, noise.rotation_std])
+            std = stds * math.sqrt(travelled)
             step = self._true.inverse() @ true_pose
             dx, dy, dtheta = (std * self._rng.standard_normal(3)).tolist()
             noisy = Pose2D(step.x + dx, step.y + dy, step.theta + dtheta, np.diag(std**2))

@@ -10,16 +10,23 @@ import numpy as np
 from prim.arrays import FloatArray
 from prim.log.messages import LASER_FRAME
 from prim.scan import Scan, beam_directions
-from prim.se2 import Pose2D
+from prim.se2 import Pose2D, rotate
 from prim.world import World
 
 
 @dataclass(frozen=True)
 class Lidar:
-    """A 2D LiDAR at the robot's centre: ``rays`` beams over ``fov`` (rad) from -fov/2 to fov/2, both included.
+    """A 2D LiDAR at the robot's centre, all of whose beams measure at once.
 
-    Ranges (m) get Gaussian noise of ``noise_std`` (m). Then one below ``range_min`` reads -inf and one above
-    ``range_max`` +inf, as does a beam that meets nothing within ``range_max`` (REP 117).
+    The defaults are the paper's (III-B, IV-A), but for the noise.
+
+    Attributes:
+        rays: The number of beams.
+        fov: Field of view (rad), from -fov/2 to fov/2, both included.
+        range_min: The shortest range that is measured (m).
+        range_max: The longest one (m).
+        noise_std: Standard deviation of the Gaussian noise on each range (m).
+
     """
 
     rays: int = 500
@@ -30,19 +37,38 @@ class Lidar:
 
     @property
     def angle_increment(self) -> float:
-        """Radians between neighbouring beams."""
+        """From one beam's bearing to the next one's (rad)."""
         return self.fov / (self.rays - 1) if self.rays > 1 else 0.0
 
     def exact(self, world: World, pose: Pose2D) -> FloatArray:
-        """Noise-free ranges (rays,) of a laser at ``pose``; inf beyond ``range_max``."""
+        """Compute ranges without noise.
+
+        Args:
+            world: What is around.
+            pose: The laser's pose.
+
+        Returns:
+            Ranges (rays,) in m; inf beyond ``range_max``.
+
+        """
         beams = beam_directions(-self.fov / 2, self.angle_increment, self.rays)
-        cos, sin = math.cos(pose.theta), math.sin(pose.theta)
-        directions = beams @ np.array([[cos, sin], [-sin, cos]])
-        distances = world.cast((pose.x, pose.y), directions)
+        distances = world.cast((pose.x, pose.y), rotate(beams, pose.theta))
         return np.where(distances > self.range_max, np.inf, distances)
 
     def measure(self, world: World, pose: Pose2D, stamp: int, period: float, rng: np.random.Generator) -> Scan:
-        """One scan at ``stamp`` (ns), all its beams at once; ``period`` (s) is the time between scans."""
+        """Take a scan; what noise moves out of the limits reads -inf or +inf (REP 117).
+
+        Args:
+            world: What is around.
+            pose: The laser's pose.
+            stamp: The scan's time (ns).
+            period: Time between scans (s).
+            rng: Draws the noise.
+
+        Returns:
+            The scan.
+
+        """
         ranges = self.exact(world, pose) + self.noise_std * rng.standard_normal(self.rays)
         ranges[ranges < self.range_min] = -np.inf
         ranges[ranges > self.range_max] = np.inf
@@ -60,22 +86,50 @@ class Lidar:
 
 @dataclass(frozen=True)
 class Gps:
-    """A position sensor with Gaussian noise of ``noise_std`` (m) on x and y each."""
+    """A position sensor.
+
+    Attributes:
+        noise_std: Standard deviation of the Gaussian noise on x and on y (m).
+
+    """
 
     noise_std: float = 0.1
 
     def measure(self, pose: Pose2D, rng: np.random.Generator) -> tuple[float, float]:
-        """x, y (m)."""
+        """Measure the position.
+
+        Args:
+            pose: The robot's pose.
+            rng: Draws the noise.
+
+        Returns:
+            x, y (m).
+
+        """
         dx, dy = self.noise_std * rng.standard_normal(2)
         return pose.x + dx, pose.y + dy
 
 
 @dataclass(frozen=True)
 class Compass:
-    """A heading sensor with Gaussian noise of ``noise_std`` (rad)."""
+    """A heading sensor.
+
+    Attributes:
+        noise_std: Standard deviation of the Gaussian noise (rad).
+
+    """
 
     noise_std: float = math.radians(3)
 
     def measure(self, pose: Pose2D, rng: np.random.Generator) -> float:
-        """The heading (rad)."""
+        """Measure the heading.
+
+        Args:
+            pose: The robot's pose.
+            rng: Draws the noise.
+
+        Returns:
+            The heading (rad).
+
+        """
         return pose.theta + self.noise_std * rng.standard_normal()

@@ -1,10 +1,10 @@
-"""One recorded session: a world, a robot that moves in it, and everything it senses, written to a log."""
+"""A recorded session: a world, a robot that moves in it, and everything that it senses, written to a log."""
 
 from __future__ import annotations
 
 import json
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, fields
 from itertools import chain
 from pathlib import Path
 
@@ -42,14 +42,16 @@ from prim.log.messages import (
 from prim.log.writer import LogWriter
 from prim.se2 import Pose2D
 from prim.world import World
-from recorder.motion import Step, drive, warp
+from recorder.motion import ExplorerOptions, Step, drive, warp
 from recorder.odometry import Odometry, OdometryNoise
 from recorder.sensors import Compass, Gps, Lidar
-from recorder.simulator import Simulator
-from recorder.world import WorldOptions, draw_world
+from recorder.simulator import Simulator, SimulatorOptions
+from recorder.world import PlacementOptions, WorldOptions, draw_world
 
 START = 1_735_689_600_000_000_000
-"""The first stamp of every session (ns): 2025-01-01, since a session must be the same whenever it is recorded."""
+"""The first stamp of every session (ns), 2025-01-01: a session must be the same whenever it is recorded."""
+
+NS_PER_S = 1e9
 
 _TOPICS = (
     (TF_STATIC_TOPIC, TF_TYPE),
@@ -66,11 +68,26 @@ _LATCHED = (TF_STATIC_TOPIC, TRUE_PRIMITIVES_TOPIC)
 
 @dataclass(frozen=True)
 class SessionOptions:
-    """All that makes a session: with the same options the same bytes are written.
+    """All that makes a session: the same options write the same bytes.
 
-    ``motion`` is ``warp``, over ``stops`` (cols, rows), or ``drive``, for ``duration`` seconds at up to ``speed``
-    (m/s), with odometry that drifts and, if they are ``movable``, primitives that can be pushed. ``rate`` is the
-    number of scans per second.
+    Attributes:
+        seed: Seeds every random choice; each cause of chance has a generator of its own.
+        world: What is drawn, unless the world is read from a file.
+        world_file: A JSON file of the world, as World.to_json makes it.
+        motion: «warp», over ``stops``; or «drive», with odometry that drifts.
+        stops: Columns and rows of the places that the robot is warped to.
+        duration: How long it drives (s).
+        speed: Largest rim speed of a wheel (m/s).
+        movable: Whether a driving robot can push the primitives.
+        rate: Scans per second.
+        lidar: The LiDAR and its noise.
+        gps: The position sensor's noise.
+        compass: The heading sensor's noise.
+        odometry: The noise of a driving robot's odometry.
+        simulator: Robot and physics.
+        explorer: How a driving robot explores.
+        placement: How the primitives of a drawn world are placed.
+
     """
 
     seed: int = 0
@@ -86,11 +103,23 @@ class SessionOptions:
     gps: Gps = field(default_factory=Gps)
     compass: Compass = field(default_factory=Compass)
     odometry: OdometryNoise = field(default_factory=OdometryNoise)
+    simulator: SimulatorOptions = field(default_factory=SimulatorOptions)
+    explorer: ExplorerOptions = field(default_factory=ExplorerOptions)
+    placement: PlacementOptions = field(default_factory=PlacementOptions)
 
 
 @dataclass(frozen=True)
 class Session:
-    """What was recorded."""
+    """A session that was recorded.
+
+    Attributes:
+        path: The log.
+        world: The world at the start.
+        scans: The number of scans.
+        skipped: The number of stops where the robot would touch something, and was not put.
+        duration: From the first scan to the last (s).
+
+    """
 
     path: Path
     world: World
@@ -100,7 +129,7 @@ class Session:
 
 
 @dataclass(frozen=True)
-class _Streams:
+class _Generators:
     """A random generator for each cause of chance, so that more of one never changes another."""
 
     world: np.random.Generator
@@ -111,84 +140,109 @@ class _Streams:
     odometry: np.random.Generator
 
     @classmethod
-    def from_seed(cls, seed: int) -> _Streams:
-        children = np.random.SeedSequence(seed).spawn(6)
+    def from_seed(cls, seed: int) -> _Generators:
+        children = np.random.SeedSequence(seed).spawn(len(fields(cls)))
         return cls(*(np.random.default_rng(child) for child in children))
 
 
-def record(path: Path, options: SessionOptions) -> Session:
-    """Records a session to ``path``. Raises UsageError, WorldError, OutputError."""
-    streams = _Streams.from_seed(options.seed)
-    world = World.load(options.world_file) if options.world_file else draw_world(streams.world, options.world)
-    steps = _steps(Simulator(world, movable=options.movable), options, streams.motion)
+def record_session(path: Path, options: SessionOptions) -> Session:
+    """Record a session to a log.
+
+    Args:
+        path: The log to write.
+        options: What is recorded.
+
+    Returns:
+        What was recorded.
+
+    Raises:
+        UsageError: The primitives do not fit on the floor, or the robot has no place to stand.
+        WorldError: The world's file is no world.
+        OutputError: The log cannot be written.
+
+    """
+    generators = _Generators.from_seed(options.seed)
+    if options.world_file:
+        world = World.load(options.world_file)
+    else:
+        world = draw_world(generators.world, options.world, options.placement)
+    steps = _steps(Simulator(world, options.movable, options.simulator), options, generators.motion)
     first = next(steps, None)
     if first is None:
         raise UsageError("the robot finds no free place: every stop lies inside a primitive or touches one")
     period = 1 / options.rate
     count = 0
     with LogWriter(path) as log:
-        _begin(log, options, world)
-        sensors = _Sensors(log, options, streams)
+        _write_preamble(log, options, world)
+        writer = _StepWriter(log, options, generators)
         for step in chain([first], steps):
-            sensors.write(START + round(count * period * 1e9), step)
+            writer.write(START + round(count * period * NS_PER_S), step)
             count += 1
     skipped = options.stops[0] * options.stops[1] - count if options.motion == "warp" else 0
     return Session(path, world, count, skipped, (count - 1) * period)
 
 
 def _steps(simulator: Simulator, options: SessionOptions, rng: np.random.Generator) -> Iterator[Step]:
-    """The session's moments, one for each scan."""
+    """Return the session's steps, one for each scan."""
     if options.motion == "drive":
         count = max(1, round(options.duration * options.rate))
-        return drive(simulator, rng, 1 / options.rate, count, options.speed)
+        return drive(simulator, rng, 1 / options.rate, count, options.speed, options.explorer)
     return warp(simulator, rng, options.stops)
 
 
-def _begin(log: LogWriter, options: SessionOptions, world: World) -> None:
-    """What stands at the beginning of a log: the options, the exact world, the mounting of the laser."""
+def _write_preamble(log: LogWriter, options: SessionOptions, world: World) -> None:
+    """Write what precedes the first step: the options, the exact world, the topics, the mount of the laser."""
     log.add_metadata("prim", _describe(options))
-    log.attach("world.json", "application/json", json.dumps(world.to_json(), indent=1).encode(), START)
+    log.add_attachment("world.json", "application/json", json.dumps(world.to_json(), indent=1).encode(), START)
     for topic, type_name in _TOPICS:
         log.add_topic(topic, type_name, latched=topic in _LATCHED)
     log.write(TF_STATIC_TOPIC, START, encode_transforms([(START, BASE_FRAME, LASER_FRAME, Pose2D())]))
 
 
-class _Sensors:
-    """All that is sensed and believed at one moment, and the truth of it."""
+class _StepWriter:
+    """Writes what the robot senses at a step, and the truth."""
 
-    def __init__(self, log: LogWriter, options: SessionOptions, streams: _Streams) -> None:
+    def __init__(self, log: LogWriter, options: SessionOptions, generators: _Generators) -> None:
         self._log = log
         self._options = options
-        self._streams = streams
+        self._generators = generators
         self._drifts = options.motion == "drive"
-        self._odometry = Odometry(options.odometry, streams.odometry)
+        self._odometry = Odometry(options.odometry, generators.odometry)
         self._world: World | None = None
 
     def write(self, stamp: int, step: Step) -> None:
-        """Writes one moment at ``stamp`` (ns)."""
-        log, options, streams, pose = self._log, self._options, self._streams, step.pose
+        """Write one step at ``stamp`` (ns)."""
+        log, options, generators, pose = self._log, self._options, self._generators, step.pose
         if step.world is not self._world:
             log.write(TRUE_PRIMITIVES_TOPIC, stamp, encode_primitives(stamp, step.world))
             self._world = step.world
-        believed = self._odometry.update(pose, step.travelled) if self._drifts else pose
-        log.write(GPS_TOPIC, stamp, encode_point(stamp, *options.gps.measure(pose, streams.gps)))
-        log.write(COMPASS_TOPIC, stamp, encode_compass(stamp, options.compass.measure(pose, streams.compass)))
-        log.write(ODOM_TOPIC, stamp, encode_odometry(stamp, believed))
-        log.write(TF_TOPIC, stamp, encode_transforms([(stamp, ODOM_FRAME, BASE_FRAME, believed)]))
+        odometry = self._odometry.update(pose, step.travelled) if self._drifts else pose
+        log.write(GPS_TOPIC, stamp, encode_point(stamp, *options.gps.measure(pose, generators.gps)))
+        log.write(COMPASS_TOPIC, stamp, encode_compass(stamp, options.compass.measure(pose, generators.compass)))
+        log.write(ODOM_TOPIC, stamp, encode_odometry(stamp, odometry))
+        log.write(TF_TOPIC, stamp, encode_transforms([(stamp, ODOM_FRAME, BASE_FRAME, odometry)]))
         log.write(TRUE_POSE_TOPIC, stamp, encode_pose(stamp, pose))
-        scan = options.lidar.measure(step.world, pose, stamp, 1 / options.rate, streams.lidar)
+        scan = options.lidar.measure(step.world, pose, stamp, 1 / options.rate, generators.lidar)
         log.write(SCAN_TOPIC, stamp, encode_scan(scan))
 
 
 _ONLY_FOR = {"warp": ("stops",), "drive": ("duration", "speed", "movable", "odometry")}
-"""Options that say something for one kind of motion alone."""
+"""Options that matter for one kind of motion alone."""
+
+_UNLESS_DEFAULT = ("simulator", "explorer", "placement")
+"""Options that are described only where they are not the defaults."""
 
 
 def _describe(options: SessionOptions) -> dict[str, str]:
-    """The recording options as metadata: SI units, JSON values."""
+    """Return the recording options as the log's metadata: SI units, JSON values."""
     described = asdict(options)
+    noise = options.odometry
+    described["odometry"] = {"metres": noise.translation_std, "radians": noise.rotation_std}
     for name in _ONLY_FOR["warp" if options.motion == "drive" else "drive"]:
         del described[name]
+    for name in _UNLESS_DEFAULT:
+        if getattr(options, name) == getattr(SessionOptions(), name):
+            del described[name]
     if options.world_file:
         described |= {"world_file": options.world_file.name, "world": None}
     return {"version": __version__} | {name: json.dumps(value) for name, value in described.items()}

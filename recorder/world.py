@@ -14,16 +14,18 @@ from prim.errors import UsageError
 from prim.shapes import Kind, Primitive
 from prim.world import World
 
-GAP = 0.03
-"""Primitives keep this far (m) from each other and from the floor's edge."""
-
-_TRIES_PER_PRIMITIVE = 200
-_TRIES = 20_000
-
 
 @dataclass(frozen=True)
 class WorldOptions:
-    """What a random world holds: ``per_kind`` (fewest, most) primitives of each of ``kinds``, on ``size`` metres."""
+    """What a random world holds.
+
+    Attributes:
+        size: The floor, along x and y (m).
+        kinds: The kinds of primitives that are drawn.
+        per_kind: Fewest and most primitives of each kind.
+        walls: Whether there is a wall along each edge of the floor.
+
+    """
 
     size: tuple[float, float] = (2.0, 2.0)
     kinds: tuple[Kind, ...] = tuple(Kind)
@@ -31,16 +33,48 @@ class WorldOptions:
     walls: bool = True
 
 
-def draw_world(rng: np.random.Generator, options: WorldOptions) -> World:
-    """Draws a world. Raises UsageError where the primitives asked for do not fit on the floor."""
-    tries = iter(range(_TRIES))
+@dataclass(frozen=True)
+class PlacementOptions:
+    """How primitives are placed: by rejection sampling; all set by hand.
+
+    Attributes:
+        gap: Least distance of primitives from each other and from the floor's edge (m).
+        tries_per_primitive: Places that are tried for one primitive before the world is drawn anew.
+        tries: Places that are tried in all.
+
+    """
+
+    gap: float = 0.03
+    tries_per_primitive: int = 200
+    tries: int = 20_000
+
+
+DEFAULTS = PlacementOptions()
+
+
+def draw_world(rng: np.random.Generator, options: WorldOptions, placement: PlacementOptions = DEFAULTS) -> World:
+    """Draw a world.
+
+    Args:
+        rng: Draws it.
+        options: What it holds.
+        placement: How its primitives are placed.
+
+    Returns:
+        The world.
+
+    Raises:
+        UsageError: The primitives do not fit on the floor.
+
+    """
+    tries = iter(range(placement.tries))
     while True:
         fewest, most = options.per_kind
         kinds = [kind for kind in options.kinds for _ in range(rng.integers(fewest, most, endpoint=True))]
-        primitives = _place(rng, kinds, options.size, tries)
+        primitives = _place(rng, kinds, options.size, placement, tries)
         if primitives is not None:
             world = World(options.size, tuple(primitives))
-            return world.walled() if options.walls else world
+            return world.with_walls() if options.walls else world
         if next(tries, None) is None:
             width, height = options.size
             raise UsageError(
@@ -50,17 +84,22 @@ def draw_world(rng: np.random.Generator, options: WorldOptions) -> World:
 
 
 def _place(
-    rng: np.random.Generator, kinds: Sequence[Kind], size: tuple[float, float], tries: Iterator[int]
+    rng: np.random.Generator,
+    kinds: Sequence[Kind],
+    size: tuple[float, float],
+    placement: PlacementOptions,
+    tries: Iterator[int],
 ) -> list[Primitive] | None:
-    """Primitives of these kinds, apart from each other; None where one found no place or no ``tries`` are left."""
+    """Draw primitives of these kinds, apart from each other; None where one found no place or no tries are left."""
     placed: list[Primitive] = []
     outlines: list[shapely.Polygon] = []
-    floor = shapely.box(-size[0] / 2, -size[1] / 2, size[0] / 2, size[1] / 2).buffer(-GAP, join_style="mitre")
+    gap = placement.gap
+    floor = shapely.box(-size[0] / 2, -size[1] / 2, size[0] / 2, size[1] / 2).buffer(-gap, join_style="mitre")
     for kind in kinds:
-        for _ in islice(tries, _TRIES_PER_PRIMITIVE):
+        for _ in islice(tries, placement.tries_per_primitive):
             primitive = draw_primitive(rng, kind, size)
             outline = shapely.Polygon(primitive.outline())
-            if floor.contains(outline) and all(outline.distance(other) >= GAP for other in outlines):
+            if floor.contains(outline) and all(outline.distance(other) >= gap for other in outlines):
                 placed.append(primitive)
                 outlines.append(outline)
                 break
@@ -70,7 +109,17 @@ def _place(
 
 
 def draw_primitive(rng: np.random.Generator, kind: Kind, size: tuple[float, float]) -> Primitive:
-    """One primitive of random size, heading and place (its size within the paper's ranges)."""
+    """Draw one primitive: sizes as its kind's row in the table of kinds has it, heading and place uniform.
+
+    Args:
+        rng: Draws it.
+        kind: Its kind.
+        size: The floor, along x and y (m).
+
+    Returns:
+        The primitive, its centroid on the floor.
+
+    """
     lengths = kind.row.draw(rng)
     theta = rng.uniform(0, 2 * math.pi) if kind.has_angle else None
     x, y = (rng.uniform(-length / 2, length / 2) for length in size)

@@ -8,7 +8,7 @@ from hypothesis import settings
 
 from prim.scan import Scan
 from recorder.sensors import Lidar
-from recorder.session import Session, SessionOptions, record
+from recorder.session import Session, SessionOptions, record_session
 from recorder.world import WorldOptions
 
 settings.register_profile("prim", deadline=None)
@@ -19,7 +19,7 @@ DATA = Path(os.environ.get("PRIM_TEST_DATA", Path(__file__).parents[2] / "shared
 
 @pytest.fixture
 def real_log() -> Callable[[str], Path]:
-    """A real log by name; the test is skipped where the logs are not at hand."""
+    """Return a function that finds a public log by name, and skips the test where it is not at hand."""
 
     def find(name: str) -> Path:
         path = DATA / name
@@ -35,19 +35,19 @@ def quiet_session(tmp_path_factory: pytest.TempPathFactory) -> Session:
     """A recorded session without any LiDAR noise."""
     path = tmp_path_factory.mktemp("quiet") / "quiet.mcap"
     world = WorldOptions(per_kind=(1, 1))
-    return record(path, SessionOptions(seed=11, world=world, lidar=Lidar(noise_std=0.0)))
+    return record_session(path, SessionOptions(seed=11, world=world, lidar=Lidar(noise_std=0.0)))
 
 
 @pytest.fixture(scope="session")
 def noisy_session(tmp_path_factory: pytest.TempPathFactory) -> Session:
     """A small recorded session with noise: 5 x 5 stops, 180 rays."""
     path = tmp_path_factory.mktemp("noisy") / "noisy.mcap"
-    return record(path, SessionOptions(seed=5, stops=(5, 5), lidar=Lidar(rays=180)))
+    return record_session(path, SessionOptions(seed=5, stops=(5, 5), lidar=Lidar(rays=180)))
 
 
 @pytest.fixture
 def in_tmp(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
-    """Runs the test in an empty folder."""
+    """Run the test in an empty folder."""
     monkeypatch.chdir(tmp_path)
     yield tmp_path
 

@@ -1,4 +1,4 @@
-"""Reading CDR, the bytes of ROS 2 messages: a cursor that knows alignment and where the message ends."""
+"""Reading CDR, the serialization of ROS 2 messages (OMG DDS-XTypes, plain CDR version 1)."""
 
 from __future__ import annotations
 
@@ -8,14 +8,23 @@ import numpy as np
 from numpy.typing import NDArray
 
 SECOND = 1_000_000_000
+"""Nanoseconds."""
 
 
 class CdrError(ValueError):
-    """Bytes that are not the message that they should be."""
+    """Bytes that are not the expected message."""
 
 
 class CdrReader:
-    """Reads the fields of one message in their order, either byte order. Raises CdrError past its end."""
+    """A cursor over one message: reads its fields in their order, in either byte order, and respects alignment.
+
+    Args:
+        data: The message, its encapsulation header included.
+
+    Raises:
+        CdrError: The header is not plain CDR's; or, from any method, the message ends before the field does.
+
+    """
 
     __slots__ = ("_at", "_data", "_order")
 
@@ -27,7 +36,16 @@ class CdrReader:
         self._at = 4
 
     def unpack(self, form: str, size: int) -> tuple[float, ...]:
-        """Fields of one ``size`` (bytes), by struct's letters; alignment counts from behind the encapsulation."""
+        """Read primitive fields of one size.
+
+        Args:
+            form: Their types, by the letters of the module struct.
+            size: Their size, which is also their alignment (bytes, counted from behind the encapsulation header).
+
+        Returns:
+            The values.
+
+        """
         at = self._at + (4 - self._at) % size
         try:
             values = struct.unpack_from(self._order + form, self._data, at)
@@ -37,14 +55,14 @@ class CdrReader:
         return values
 
     def length(self, item_size: int) -> int:
-        """The length field of a string or sequence, held against the bytes that are there."""
+        """Read the length of a string or sequence of items of ``item_size`` bytes; it must fit into the message."""
         count = int(self.unpack("I", 4)[0])
         if count * item_size > len(self._data) - self._at:
             raise CdrError(f"it claims {count} items at byte {self._at} of {len(self._data)}")
         return count
 
     def string(self) -> str:
-        """A string, its closing NUL left off."""
+        """Read a string, without its closing NUL."""
         count = self.length(1)
         start, self._at = self._at, self._at + count
         try:
@@ -53,22 +71,28 @@ class CdrReader:
             raise CdrError(f"a string at byte {start} is not text: {error.reason}") from None
 
     def floats(self) -> NDArray[np.float32]:
-        """A sequence of float32, copied."""
+        """Read a sequence of float32 into an array of its own."""
         count = self.length(4)
         start, self._at = self._at, self._at + 4 * count
         return np.frombuffer(self._data, self._order + "f4", count, start).astype(np.float32)
 
     def skip(self, item_size: int, alignment: int) -> None:
-        """Passes over a sequence of items of one size."""
+        """Skip a sequence of items of one size.
+
+        Args:
+            item_size: Bytes an item.
+            alignment: Of the first item (bytes).
+
+        """
         count = self.length(item_size)
         if count:
             self._at += (4 - self._at) % alignment + count * item_size
 
     def stamp(self) -> int:
-        """A time in ns."""
+        """Read a builtin_interfaces/Time (ns)."""
         seconds, nanoseconds = self.unpack("iI", 4)
         return int(seconds) * SECOND + int(nanoseconds)
 
     def header(self) -> tuple[int, str]:
-        """A std_msgs/Header: stamp (ns) and frame."""
+        """Read a std_msgs/Header: stamp (ns) and frame."""
         return self.stamp(), self.string()

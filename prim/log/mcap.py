@@ -1,4 +1,4 @@
-"""Opening, reading and writing MCAP logs. All that can be wrong with a file becomes one LogReadError."""
+"""Reading MCAP logs (https://mcap.dev/spec): by their index where they are intact, else record by record."""
 
 from __future__ import annotations
 
@@ -7,29 +7,29 @@ import struct
 import zlib
 from collections import Counter
 from collections.abc import Callable, Container, Iterator, Mapping
-from contextlib import contextmanager, suppress
+from contextlib import suppress
 from dataclasses import dataclass, field
 from itertools import pairwise
 from pathlib import Path
 from typing import IO, TypeVar
 
-from mcap.data_stream import ReadDataStream, RecordBuilder
-from mcap.exceptions import EndOfFile, InvalidMagic, McapError, RecordLengthLimitExceeded
+from mcap.data_stream import RecordBuilder
+from mcap.exceptions import EndOfFile, McapError
 from mcap.opcode import Opcode
 from mcap.reader import SeekingReader
-from mcap.records import Attachment, Channel, Chunk, McapRecord, Metadata, Schema
+from mcap.records import Attachment, Channel, McapRecord, Metadata, Schema
 from mcap.records import Message as McapMessage
-from mcap.stream_reader import CRCValidationError, StreamReader, breakup_chunk, get_chunk_data_stream
+from mcap.stream_reader import StreamReader, get_chunk_data_stream
 from mcap.summary import Summary
 
 from prim.errors import LogReadError
-from prim.log.source import Message, Topic
+from prim.log.recovery import RECORD_LIMIT, RECOVER_HINT, RecordReader, read_chunk, translated_errors
+from prim.log.source import Decoded, Message, Topic
 
 MAGIC = b"\x89MCAP0\r\n"
 
 FOOTER_BYTES = 1 + 8 + 8 + 8 + 4 + len(MAGIC)
-RECORD_LIMIT = 1 << 30
-"""No record of a readable log is larger (bytes); a length beyond it is damage."""
+"""A file's end: the footer record (opcode, length, summary start, summary offset start, CRC) and the magic."""
 
 _OTHER_FORMATS = (
     (b"#ROSBAG", "a ROS 1 bag", "convert it with: rosbags-convert --dst-storage mcap"),
@@ -37,19 +37,17 @@ _OTHER_FORMATS = (
     (b"\x89PNG", "a PNG image", "give an .mcap log"),
     (b"RRF2", "a rerun recording", "open it with: rerun FILE"),
 )
+"""First bytes of files that are no MCAP logs, what they are, and what to do."""
+
 _RECORD = struct.Struct("<BQ")
-"""What every record begins with: opcode and length."""
+"""The prefix of every record: opcode and length."""
 _MESSAGE = struct.Struct("<HIQQ")
-"""What a message record begins with: channel, sequence, log time, publish time."""
-
-_SALVAGE = "read what is left of it with --recover"
-
-Decoded = TypeVar("Decoded")
+"""The prefix of a message record: channel, sequence, log time, publish time."""
 
 
 @dataclass
 class _Contents:
-    """What a log holds besides its messages, as its summary or a pass over it tells."""
+    """What a log holds besides its messages, from its summary or from a pass over all records."""
 
     channels: dict[int, Channel] = field(default_factory=dict)
     schemas: dict[int, Schema] = field(default_factory=dict)
@@ -57,20 +55,28 @@ class _Contents:
     metadata: dict[str, Mapping[str, str]] = field(default_factory=dict)
 
 
-class LogReader:
-    """A log that is open for reading, message by message, in bounded memory.
+class McapReader:
+    """An MCAP log that is open for reading: a :class:`prim.log.source.LogSource`.
 
-    An intact log is read by its index, in the order of log times. With ``recover`` a damaged one is read chunk by
-    chunk, by its index where that is whole and else in file order, and what could not be read is told by
-    :attr:`lost`. Raises LogReadError.
+    An intact log is read by its index, in the order of log times. With ``recover``, every log is read chunk by chunk,
+    by the index of chunks where that is intact and else in file order.
+
+    Args:
+        path: The file, or a folder with one in it.
+        recover: Pass over damage, and collect it in :attr:`lost`.
+
+    Raises:
+        LogReadError: The file cannot be read, is damaged (unless ``recover``), or is no MCAP log.
+
     """
 
     def __init__(self, path: Path, recover: bool = False) -> None:
-        self.path = resolve_log(path)
-        self.recover = recover
+        self.path = _resolved(path)
         self.lost: list[str] = []
+        self._recover = recover
         self._undecodable: set[tuple[str, int]] = set()
         self._file: IO[bytes] = _open(self.path)
+        self._records = RecordReader(self._file, self.path, recover)
         self._index = SeekingReader(self._file, validate_crcs=True, record_size_limit=RECORD_LIMIT)
         try:
             self._summary = self._read_summary_or_none()
@@ -79,7 +85,7 @@ class LogReader:
             self._file.close()
             raise
 
-    def __enter__(self) -> LogReader:
+    def __enter__(self) -> McapReader:
         return self
 
     def __exit__(self, *exception: object) -> None:
@@ -104,30 +110,30 @@ class LogReader:
         return self._contents.metadata
 
     def attachment(self, name: str) -> bytes | None:
-        """An attachment's bytes, None where the log has none of that name. Raises LogReadError."""
-        with _explained(self.path):
+        """See :meth:`prim.log.source.LogSource.attachment`."""
+        with translated_errors(self.path):
             found = self._find_attachment(name)
             if found is None or _crc_fits(found, self._file):
                 return found.data if found else None
         what = f"the CRC of its attachment {name} does not fit"
-        if not self.recover:
-            raise LogReadError(self.path, f"damaged: {what}", _SALVAGE)
+        if not self._recover:
+            raise LogReadError(self.path, f"damaged: {what}", RECOVER_HINT)
         self.lost.append(what)
         return None
 
     def _find_attachment(self, name: str) -> Attachment | None:
-        """The attachment, with the file standing where its record ends."""
+        """Return the attachment; the file's position is then the end of its record."""
         if self._summary is None:
-            found = (r for r in self._linear_records([]) if isinstance(r, Attachment) and r.name == name)
+            found = (r for r in self._records.linear([]) if isinstance(r, Attachment) and r.name == name)
             return next(found, None)
-        for place in self._summary.attachment_indexes:
-            if place.name == name:
-                return _record_at(self._file, place.offset, Attachment)
+        for index in self._summary.attachment_indexes:
+            if index.name == name:
+                return _record_at(self._file, index.offset, Attachment)
         return None
 
     @property
     def messages_lost(self) -> int | None:
-        """How many messages of a damaged log could not be read; None where nothing says how many there were."""
+        """The number of messages that could not be read; None where the log does not say how many there were."""
         if not self.lost:
             return 0
         if self._summary is None or self._summary.statistics is None:
@@ -136,27 +142,27 @@ class LogReader:
         return unread + len(self._undecodable)
 
     def of_type(self, *types: str) -> list[Topic]:
-        """The topics that carry messages of any of these types and are not empty, by name."""
+        """See :meth:`prim.log.source.LogSource.of_type`."""
         fitting = (topic for topic in self.topics.values() if topic.type in types and topic.messages)
         return sorted(fitting, key=lambda topic: topic.name)
 
     def messages(self, *topics: str) -> Iterator[Message]:
-        """The messages of these topics. Raises LogReadError where the log is damaged or short of messages."""
-        if self.recover or self._summary is None or not self._summary.chunk_indexes:
-            yield from self._linear_messages(topics)
+        """See :meth:`prim.log.source.LogSource.messages`; a log that is recovered is read in file order."""
+        if self._recover or self._summary is None or not self._summary.chunk_indexes:
+            yield from self._unindexed_messages(topics)
             return
         delivered: Counter[str] = Counter()
-        with _explained(self.path):
+        with translated_errors(self.path):
             for message in self._indexed_messages(self._summary, topics):
                 delivered[message.topic] += 1
                 yield message
         for name in topics:
             if name in self.topics and delivered[name] != self.topics[name].messages:
                 what = f"{name} has {delivered[name]} messages where the summary counts {self.topics[name].messages}"
-                raise LogReadError(self.path, f"damaged: {what}", _SALVAGE)
+                raise LogReadError(self.path, f"damaged: {what}", RECOVER_HINT)
 
     def _indexed_messages(self, summary: Summary, topics: tuple[str, ...]) -> Iterator[Message]:
-        """Messages in the order of log times, by the index of chunks."""
+        """Yield messages in the order of log times, by the index of chunks."""
         chunks = sorted(summary.chunk_indexes, key=lambda index: index.message_start_time)
         if any(a.message_end_time > b.message_start_time for a, b in pairwise(chunks)):
             for _, channel, message in self._index.iter_messages(topics):  # chunks that overlap must be merged
@@ -166,23 +172,24 @@ class LogReader:
         for index in chunks:
             if index.message_index_offsets and wanted.keys().isdisjoint(index.message_index_offsets):
                 continue
-            self._file.seek(index.chunk_start_offset + 1 + 8)
-            chunk = Chunk.read(ReadDataStream(self._file))
-            stream, length = get_chunk_data_stream(chunk, validate_crc=True)
+            stream, length = get_chunk_data_stream(read_chunk(self._file, index), validate_crc=True)
             yield from sorted(_chunk_messages(stream.read(length), wanted), key=lambda message: message.log_time)
 
+    def _unindexed_messages(self, topics: tuple[str, ...]) -> Iterator[Message]:
+        names = {number: channel.topic for number, channel in self._contents.channels.items()}
+        for record in self._all_records([]):
+            if isinstance(record, McapMessage) and names.get(record.channel_id) in topics:
+                yield Message(names[record.channel_id], record.log_time, record.data)
+
     def decoded(self, topic: Topic, decode: Callable[[bytes], Decoded]) -> Iterator[tuple[int, Decoded]]:
-        """Log time (ns) and decoded message of one topic. Raises LogReadError on messages that do not decode."""
+        """See :meth:`prim.log.source.LogSource.decoded`."""
         for _, log_time, decoded in self.numbered(topic, decode):
             yield log_time, decoded
 
     def numbered(
         self, topic: Topic, decode: Callable[[bytes], Decoded], wanted: Container[int] | None = None
     ) -> Iterator[tuple[int, int, Decoded]]:
-        """As :meth:`decoded`, with the number of each message on its topic; of those, only the ``wanted`` ones.
-
-        All of the topic is read even so: only its end shows whether messages are missing.
-        """
+        """See :meth:`prim.log.source.LogSource.numbered`."""
         if topic.encoding != "cdr":
             raise LogReadError(
                 self.path,
@@ -200,8 +207,8 @@ class LogReader:
             yield index, message.log_time, decoded
 
     def _reject(self, topic: Topic, index: int, error: ValueError) -> None:
-        """Tells of a message that cannot be decoded: with ``recover`` a loss, else a LogReadError."""
-        if not self.recover:
+        """Count a message that cannot be decoded as lost; unless recovering, raise LogReadError."""
+        if not self._recover:
             what = f"message {index} of {topic.name} cannot be decoded: {error}"
             raise LogReadError(self.path, what, "pass over such messages with --recover")
         if not any(name == topic.name for name, _ in self._undecodable):
@@ -209,39 +216,40 @@ class LogReader:
         self._undecodable.add((topic.name, index))
 
     def _read_summary(self) -> Summary | None:
-        """The log's summary, its CRC checked; None where a complete log has none. Raises LogReadError."""
+        """Read the log's summary and check its CRC; None where a complete log has none. Raises LogReadError."""
         size = self._file.seek(0, os.SEEK_END)
         self._file.seek(max(size - FOOTER_BYTES, 0))
         end = self._file.read()
         if len(end) < FOOTER_BYTES or not end.endswith(MAGIC) or end[0] != Opcode.FOOTER:
-            raise LogReadError(self.path, f"truncated: its end is missing ({size} bytes)", _SALVAGE)
-        start, _, crc = struct.unpack_from("<QQI", end, 9)
+            raise LogReadError(self.path, f"truncated: its end is missing ({size} bytes)", RECOVER_HINT)
+        start, _, crc = struct.unpack_from("<QQI", end, _RECORD.size)
         if start == 0:
             return None
         if start > size - FOOTER_BYTES:
-            raise LogReadError(self.path, "damaged: its summary lies beyond its end", _SALVAGE)
+            raise LogReadError(self.path, "damaged: its summary lies beyond its end", RECOVER_HINT)
         self._file.seek(start)
-        summary = self._file.read(size - FOOTER_BYTES - start) + end[:25]
+        covered = FOOTER_BYTES - len(MAGIC) - 4  # the CRC covers the footer up to itself
+        summary = self._file.read(size - FOOTER_BYTES - start) + end[:covered]
         if crc and zlib.crc32(summary) != crc:
-            raise LogReadError(self.path, "damaged: the CRC of its summary does not fit", _SALVAGE)
-        with _explained(self.path):
+            raise LogReadError(self.path, "damaged: the CRC of its summary does not fit", RECOVER_HINT)
+        with translated_errors(self.path):
             return self._index.get_summary()
 
     def _read_summary_or_none(self) -> Summary | None:
-        """A summary that says where everything is; None where there is none, or none that is whole to recover by."""
+        """Return a summary that indexes the whole log; None where there is none, or only a damaged one to recover."""
         try:
             summary = self._read_summary()
         except LogReadError:
-            if not self.recover:
+            if not self._recover:
                 raise
             return None
         complete = summary is not None and summary.statistics is not None and summary.channels
         return summary if complete else None
 
     def _read_contents(self) -> _Contents:
-        if self.recover or self._summary is None:
+        if self._recover or self._summary is None:
             return self._scan_contents()
-        with _explained(self.path):
+        with translated_errors(self.path):
             contents = _Contents(self._summary.channels, self._summary.schemas)
             if self._summary.statistics is not None:
                 contents.counts.update(self._summary.statistics.channel_message_counts)
@@ -253,13 +261,14 @@ class LogReader:
         return {record.name: record.metadata for record in records}
 
     def _scan_contents(self) -> _Contents:
+        """Collect the contents from all records, and note in :attr:`lost` what cannot be read."""
         contents = _Contents()
         if self._summary is not None:
             contents.channels.update(self._summary.channels)
             contents.schemas.update(self._summary.schemas)
-            with suppress(LogReadError), _explained(self.path):
+            with suppress(LogReadError), translated_errors(self.path):
                 contents.metadata.update(self._indexed_metadata(self._summary))
-        for record in self._records(self.lost):
+        for record in self._all_records(self.lost):
             if isinstance(record, Channel):  # the first one counts: it lies in a chunk, whose CRC was checked
                 contents.channels.setdefault(record.id, record)
             elif isinstance(record, Schema):
@@ -273,64 +282,15 @@ class LogReader:
             self.lost.append(f"{expected.message_count - contents.counts.total()} messages that the summary counts")
         return contents
 
-    def _linear_messages(self, topics: tuple[str, ...]) -> Iterator[Message]:
-        names = {number: channel.topic for number, channel in self._contents.channels.items()}
-        for record in self._records([]):
-            if isinstance(record, McapMessage) and names.get(record.channel_id) in topics:
-                yield Message(names[record.channel_id], record.log_time, record.data)
-
-    def _records(self, lost: list[str]) -> Iterator[McapRecord]:
-        """All records, by the index of chunks where there is one, else in file order."""
+    def _all_records(self, lost: list[str]) -> Iterator[McapRecord]:
+        """Return all records, by the index of chunks where there is one, else in file order."""
         if self._summary is None or not self._summary.chunk_indexes:
-            yield from self._linear_records(lost)
-            return
-        for index in sorted(self._summary.chunk_indexes, key=lambda index: index.chunk_start_offset):
-            try:
-                with _explained(self.path):
-                    self._file.seek(index.chunk_start_offset + 1 + 8)
-                    chunk = Chunk.read(ReadDataStream(self._file))
-            except LogReadError as error:
-                lost.append(f"a chunk at byte {index.chunk_start_offset}: {error.what}")
-                continue
-            yield from self._chunk_records(chunk, lost)
-
-    def _linear_records(self, lost: list[str]) -> Iterator[McapRecord]:
-        """All records in file order; with ``recover`` damaged chunks are passed over and noted in ``lost``."""
-        self._file.seek(0)
-        stream = StreamReader(self._file, emit_chunks=True, record_size_limit=RECORD_LIMIT).records
-        while True:
-            try:
-                with _explained(self.path):
-                    record = next(stream, None)
-            except LogReadError as error:
-                if not self.recover:
-                    raise
-                lost.append(f"all beyond byte {self._file.tell()}: {error.what}")
-                return
-            if record is None:
-                return
-            if isinstance(record, Chunk):
-                yield from self._chunk_records(record, lost)
-            else:
-                yield record
-
-    def _chunk_records(self, chunk: Chunk, lost: list[str]) -> list[McapRecord]:
-        try:
-            with _explained(self.path):
-                return breakup_chunk(chunk, validate_crc=True)
-        except LogReadError as error:
-            if not self.recover:
-                raise
-            seconds = (chunk.message_end_time - chunk.message_start_time) / 1e9
-            lost.append(f"a chunk of {seconds:.2f} s that ends at byte {self._file.tell()}: {error.what}")
-            return []
+            return self._records.linear(lost)
+        return self._records.indexed(self._summary.chunk_indexes, lost)
 
 
-def resolve_log(path: Path) -> Path:
-    """The log's file: ``path`` itself, or the one .mcap file in it if it is a folder (a ROS 2 bag).
-
-    Raises LogReadError.
-    """
+def _resolved(path: Path) -> Path:
+    """Return the log's file: ``path`` itself, or the one .mcap file in the folder ``path`` (a ROS 2 bag)."""
     if not path.is_dir():
         return path
     logs = sorted(path.glob("*.mcap"))
@@ -343,18 +303,18 @@ def resolve_log(path: Path) -> Path:
 
 
 def _ros2_name(name: str) -> str:
-    """ROS 1 and ROS 2 names of a type made one: package/Type becomes package/msg/Type."""
+    """Return the ROS 2 name of a message type: of ROS 1's package/Type, package/msg/Type."""
     parts = name.split("/")
     return f"{parts[0]}/msg/{parts[1]}" if len(parts) == 2 else name
 
 
 def _open(path: Path) -> IO[bytes]:
-    """Opens a file that begins like an MCAP log. Raises LogReadError."""
+    """Open a file that begins like an MCAP log. Raises LogReadError."""
     try:
         stream = path.open("rb")
     except OSError as error:
         raise LogReadError(path, f"cannot open: {error.strerror}") from error
-    start = stream.read(16)
+    start = stream.read(max(len(magic) for magic, _, _ in _OTHER_FORMATS))
     if start.startswith(MAGIC):
         stream.seek(0)
         return stream
@@ -380,7 +340,7 @@ def _record_at(stream: IO[bytes], offset: int, kind: type[Record]) -> Record:
 
 
 def _chunk_messages(data: bytes, wanted: Mapping[int, str]) -> Iterator[Message]:
-    """The messages of the wanted channels (by number) among a chunk's records."""
+    """Yield the messages of the wanted channels (by number) among a chunk's uncompressed records."""
     at, end = 0, len(data)
     while at < end:
         opcode, length = _RECORD.unpack_from(data, at)
@@ -395,33 +355,9 @@ def _chunk_messages(data: bytes, wanted: Mapping[int, str]) -> Iterator[Message]
 
 
 def _crc_fits(attachment: Attachment, stream: IO[bytes]) -> bool:
-    """Whether an attachment is as it was written; ``stream`` stands behind its record, which ends in its CRC."""
+    """Whether an attachment's CRC holds; ``stream`` is positioned behind its record, which ends in the CRC."""
     stream.seek(-4, os.SEEK_CUR)
     stored = stream.read(4)
     builder = RecordBuilder()
     attachment.write(builder)
     return stored in (b"\0\0\0\0", builder.end()[-4:])  # type: ignore[no-untyped-call]
-
-
-@contextmanager
-def _explained(path: Path) -> Iterator[None]:
-    """Turns everything that mcap and its codecs raise on damaged files into a LogReadError."""
-    try:
-        yield
-    except (LogReadError, AttributeError, NameError):  # the latter two would be our own mistakes
-        raise
-    except CRCValidationError as error:
-        raise LogReadError(
-            path, f"damaged: the CRC of a {type(error.record).__name__} does not fit", _SALVAGE
-        ) from error
-    except (EndOfFile, RecordLengthLimitExceeded) as error:
-        raise LogReadError(path, "truncated or damaged: a record runs past the end", _SALVAGE) from error
-    except InvalidMagic as error:
-        raise LogReadError(path, "damaged: it does not end as an MCAP log does", _SALVAGE) from error
-    except McapError as error:
-        raise LogReadError(path, f"cannot be read: {error}") from error
-    except OSError as error:
-        raise LogReadError(path, f"cannot be read: {error.strerror or error}", _SALVAGE) from error
-    except Exception as error:  # struct.error, KeyError, ZstdError, UnicodeDecodeError, ...: the file is damaged
-        what = f"damaged: its records do not fit together ({type(error).__name__}: {error})"
-        raise LogReadError(path, what, _SALVAGE) from error

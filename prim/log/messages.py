@@ -1,7 +1,8 @@
-"""The log's topics and the codecs of its messages: CDR bytes on one side, our own types on the other.
+"""The log's topics and the codecs of its messages: CDR on one side, prim's own types on the other.
 
-What a replay reads is read by a cursor of our own, several times as fast as a typestore and ready at once; scans are
-written by our own codec, and all other messages by rosbags' typestore, which is imported when it is first needed.
+Messages are decoded with :class:`prim.log.cdr.CdrReader`, several times as fast as with a typestore, and without its
+start-up. Scans are encoded by a codec of our own, all other messages by rosbags' typestore, which is imported when it
+is first needed.
 """
 
 from __future__ import annotations
@@ -47,11 +48,24 @@ BASE_FRAME = "base_link"
 LASER_FRAME = "laser"
 
 _SCAN_HEAD, _SCAN_GEOMETRY = struct.Struct("<iII"), struct.Struct("<7fI")
+"""A LaserScan up to its frame: seconds, nanoseconds, length of the frame; behind it: angles, times, limits, count."""
 _LITTLE_ENDIAN = b"\x00\x01\x00\x00"
+"""The encapsulation header of plain CDR, little endian."""
+_FRAME_AT = len(_LITTLE_ENDIAN) + _SCAN_HEAD.size
+"""Where the frame of a message that begins with a header begins (bytes)."""
 
 
 class StampedPose(NamedTuple):
-    """A pose as ROS messages hold it: stamp (ns), both frames, translation (m), quaternion (x, y, z, w)."""
+    """A pose as ROS messages hold it.
+
+    Attributes:
+        stamp: ns.
+        frame_id: The frame that the pose is given in.
+        child_frame_id: The frame whose pose it is; empty where the message does not say.
+        translation: x, y, z (m).
+        rotation: Unit quaternion x, y, z, w.
+
+    """
 
     stamp: int
     frame_id: str
@@ -64,12 +78,11 @@ class StampedPose(NamedTuple):
 
 
 def encode_scan(scan: Scan) -> bytes:
-    """A scan as the CDR bytes of sensor_msgs/LaserScan, without intensities."""
+    """Encode a scan as sensor_msgs/LaserScan, without intensities."""
     frame = scan.frame_id.encode() + b"\x00"
-    head = struct.pack("<iII", *divmod(scan.stamp, SECOND), len(frame)) + frame
+    head = _SCAN_HEAD.pack(*divmod(scan.stamp, SECOND), len(frame)) + frame
     count = len(scan.ranges)
-    geometry = struct.pack(
-        "<7fI",
+    geometry = _SCAN_GEOMETRY.pack(
         scan.angle_min,
         scan.angle_min + scan.angle_increment * (count - 1),
         scan.angle_increment,
@@ -86,14 +99,14 @@ def encode_scan(scan: Scan) -> bytes:
 
 
 def decode_scan(data: bytes) -> Scan:
-    """The inverse of :func:`encode_scan`, either byte order. Raises ValueError on bytes that are no LaserScan."""
+    """Decode a sensor_msgs/LaserScan of either byte order. Raises ValueError."""
     if data[:2] != b"\0\1":
         return _decode_scan(CdrReader(data))
-    try:  # most of a log: the same in few calls
-        seconds, nanoseconds, length = _SCAN_HEAD.unpack_from(data, 4)
-        geometry = 16 + length + -length % 4
+    try:  # scans are most of a log: the same as _decode_scan in fewer calls
+        seconds, nanoseconds, length = _SCAN_HEAD.unpack_from(data, len(_LITTLE_ENDIAN))
+        geometry = _FRAME_AT + length + -length % 4
         values = _SCAN_GEOMETRY.unpack_from(data, geometry)
-        frame_id = data[16 : 16 + length - 1].decode()
+        frame_id = data[_FRAME_AT : _FRAME_AT + length - 1].decode()
         ranges = np.frombuffer(data, "<f4", values[7], geometry + _SCAN_GEOMETRY.size).copy()
     except (struct.error, ValueError):
         return _decode_scan(CdrReader(data))
@@ -109,7 +122,7 @@ def _decode_scan(cdr: CdrReader) -> Scan:
 
 
 def decode_stamp(data: bytes) -> int:
-    """The stamp (ns) of a CDR message that begins with a header. Raises ValueError."""
+    """Decode the stamp (ns) of a message that begins with a header. Raises ValueError."""
     return CdrReader(data).stamp()
 
 
@@ -124,7 +137,7 @@ def _typestore() -> Any:
 
 
 def message_definition(type_name: str) -> str:
-    """The ``ros2msg`` schema text of a message type."""
+    """Return the ``ros2msg`` schema of a message type."""
     return str(_typestore().generate_msgdef(type_name, ros_version=2)[0])
 
 
@@ -137,7 +150,16 @@ def _serialize(message: Any) -> bytes:
 
 
 def encode_odometry(stamp: int, pose: Pose2D) -> bytes:
-    """A pose of ``base_link`` in ``odom`` with its covariance as nav_msgs/Odometry."""
+    """Encode a pose of ``base_link`` in ``odom``, and its covariance, as nav_msgs/Odometry without velocities.
+
+    Args:
+        stamp: ns.
+        pose: The pose.
+
+    Returns:
+        The message.
+
+    """
     zero = _new("geometry_msgs/msg/Vector3", x=0.0, y=0.0, z=0.0)
     message = _new(
         ODOMETRY_TYPE,
@@ -154,28 +176,67 @@ def encode_odometry(stamp: int, pose: Pose2D) -> bytes:
 
 
 def encode_pose(stamp: int, pose: Pose2D, frame_id: str = MAP_FRAME) -> bytes:
-    """A pose as geometry_msgs/PoseStamped."""
+    """Encode a pose as geometry_msgs/PoseStamped.
+
+    Args:
+        stamp: ns.
+        pose: The pose.
+        frame_id: The frame that it is given in.
+
+    Returns:
+        The message.
+
+    """
     return _serialize(_new(POSE_TYPE, header=_header(stamp, frame_id), pose=_pose(pose)))
 
 
 def encode_point(stamp: int, x: float, y: float, frame_id: str = MAP_FRAME) -> bytes:
-    """A GPS fix in metres as geometry_msgs/PointStamped."""
+    """Encode a GPS fix as geometry_msgs/PointStamped.
+
+    Args:
+        stamp: ns.
+        x: m.
+        y: m.
+        frame_id: The frame that the point is given in.
+
+    Returns:
+        The message.
+
+    """
     return _serialize(_new(POINT_TYPE, header=_header(stamp, frame_id), point=_point(x, y)))
 
 
 def encode_compass(stamp: int, heading: float) -> bytes:
-    """A heading (rad) as the vector that points north in the robot's frame; north is the map's +y."""
+    """Encode a heading as geometry_msgs/Vector3Stamped: the direction of north (the map's +y) in the robot's frame.
+
+    Args:
+        stamp: ns.
+        heading: Of the robot in the map frame (rad).
+
+    Returns:
+        The message.
+
+    """
     north = _new("geometry_msgs/msg/Vector3", x=math.sin(heading), y=math.cos(heading), z=0.0)
     return _serialize(_new(VECTOR_TYPE, header=_header(stamp, BASE_FRAME), vector=north))
 
 
 def encode_transforms(transforms: Iterable[tuple[int, str, str, Pose2D]]) -> bytes:
-    """(stamp, parent, child, pose of the child in the parent) as tf2_msgs/TFMessage."""
+    """Encode transforms (stamp in ns, parent, child, pose of the child in the parent) as tf2_msgs/TFMessage."""
     return _serialize(_new(TF_TYPE, transforms=[_transform(*transform) for transform in transforms]))
 
 
 def encode_primitives(stamp: int, world: World) -> bytes:
-    """A world as visualization_msgs/MarkerArray: outlines to draw, kind and size as JSON in ``text``."""
+    """Encode a world as visualization_msgs/MarkerArray: outlines to draw, kind and size as JSON in ``text``.
+
+    Args:
+        stamp: ns.
+        world: The world.
+
+    Returns:
+        The message.
+
+    """
     markers = [_primitive_marker(stamp, i, primitive) for i, primitive in enumerate(world.primitives)]
     if world.walls:
         markers.append(_walls_marker(stamp, world))
@@ -183,27 +244,36 @@ def encode_primitives(stamp: int, world: World) -> bytes:
 
 
 def decode_primitives(data: bytes) -> tuple[int, tuple[Primitive, ...]]:
-    """Stamp (ns) and true primitives of a message of :func:`encode_primitives`; stamp 0 if it is empty.
+    """Invert :func:`encode_primitives`, but for the walls: return stamp (ns; 0 of an empty message) and primitives.
 
     Raises ValueError.
     """
     cdr = CdrReader(data)
     stamp, primitives = 0, []
-    for _ in range(cdr.length(1)):
+    for _ in range(cdr.length(1)):  # a marker has at least one byte
         pose, namespace, text = _read_marker(cdr)
         stamp = pose.stamp
         if namespace == "primitives":
             truth = json.loads(text)
             if not isinstance(truth, dict):
                 raise ValueError(f"a marker's text is no object: {text}")
-            seen = planar(pose)
-            primitive = Primitive.from_json({**truth, "x": seen.x, "y": seen.y, "theta": seen.theta})
+            plane = planar_pose(pose)
+            primitive = Primitive.from_json({**truth, "x": plane.x, "y": plane.y, "theta": plane.theta})
             primitives.append(primitive.canonical())
     return stamp, tuple(primitives)
 
 
 class StampedVector(NamedTuple):
-    """Three numbers as ROS messages hold them: stamp (ns), frame, x, y, z or latitude, longitude (deg), altitude."""
+    """A point or vector as ROS messages hold it.
+
+    Attributes:
+        stamp: ns.
+        frame_id: The frame that it is given in.
+        x: m, or latitude (degrees).
+        y: m, or longitude (degrees).
+        z: m, or altitude (m).
+
+    """
 
     stamp: int
     frame_id: str
@@ -213,16 +283,13 @@ class StampedVector(NamedTuple):
 
 
 def decode_vector(data: bytes) -> StampedVector:
-    """A geometry_msgs/PointStamped or Vector3Stamped. Raises ValueError."""
+    """Decode a geometry_msgs/PointStamped or Vector3Stamped. Raises ValueError."""
     cdr = CdrReader(data)
     return StampedVector(*cdr.header(), *cdr.unpack("3d", 8))
 
 
 def decode_fix(data: bytes) -> StampedVector:
-    """The latitude, longitude (degrees) and altitude (m) of a sensor_msgs/NavSatFix; NaN where it has no fix.
-
-    Raises ValueError.
-    """
+    """Decode latitude, longitude and altitude of a sensor_msgs/NavSatFix; NaN without a fix. Raises ValueError."""
     cdr = CdrReader(data)
     header = cdr.header()
     status = cdr.unpack("b", 1)[0]
@@ -232,19 +299,31 @@ def decode_fix(data: bytes) -> StampedVector:
 
 
 def decode_poses(type_name: str, data: bytes) -> list[StampedPose]:
-    """The poses in a message of any type in :data:`POSE_DECODERS`. Raises ValueError."""
+    """Decode the poses in a message.
+
+    Args:
+        type_name: Its type, one of :data:`POSE_DECODERS`.
+        data: The message.
+
+    Returns:
+        The poses.
+
+    Raises:
+        ValueError: The message is not of that type.
+
+    """
     return POSE_DECODERS[type_name](CdrReader(data))
 
 
-def planar(pose: StampedPose) -> Pose2D:
-    """The pose seen from above: x, y and the heading of the x axis."""
+def planar_pose(pose: StampedPose) -> Pose2D:
+    """Project a pose onto the x-y plane: x, y and the heading of the x axis."""
     x, y, z, w = pose.rotation
     heading = math.atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
     return Pose2D(pose.translation[0], pose.translation[1], heading)
 
 
 def _read_pose(cdr: CdrReader, stamp: int, frame_id: str, child_frame_id: str) -> StampedPose:
-    """A Pose or a Transform: they have the same fields."""
+    """Read a geometry_msgs/Pose or Transform, which have the same fields."""
     x, y, z, qx, qy, qz, qw = cdr.unpack("7d", 8)
     return StampedPose(stamp, frame_id, child_frame_id, (x, y, z), (qx, qy, qz, qw))
 
@@ -267,11 +346,11 @@ POSE_DECODERS: dict[str, Callable[[CdrReader], list[StampedPose]]] = {
     POSE_WITH_COVARIANCE_TYPE: _read_pose_stamped,
     TF_TYPE: _read_transforms,
 }
-"""Message types that hold poses, and how to read them."""
+"""The message types that hold poses, and how each is read."""
 
 
 def _read_marker(cdr: CdrReader) -> tuple[StampedPose, str, str]:
-    """A visualization_msgs/Marker: its pose, namespace and text."""
+    """Read a visualization_msgs/Marker: its pose, namespace and text."""
     stamp, frame_id = cdr.header()
     namespace = cdr.string()
     cdr.unpack("3i", 4)  # id, type, action
@@ -331,7 +410,7 @@ def _transform(stamp: int, parent: str, child: str, pose: Pose2D) -> Any:
 
 
 def _covariance36(pose: Pose2D) -> FloatArray:
-    """ROS's 6 x 6 covariance (x, y, z, roll, pitch, yaw) from a planar one; zeros where there is none."""
+    """Return ROS's covariance (36,) of x, y, z, roll, pitch, yaw; zero but for the planar part that is known."""
     covariance = np.zeros((6, 6))
     if pose.covariance is not None:
         covariance[np.ix_((0, 1, 5), (0, 1, 5))] = pose.covariance
@@ -339,10 +418,17 @@ def _covariance36(pose: Pose2D) -> FloatArray:
 
 
 _LINE_STRIP, _LINE_LIST = 4, 5
+"""Marker types of visualization_msgs/Marker."""
+_LINE_WIDTH = 0.01
+"""m."""
+_OUTLINE_POINTS = 64
+"""Vertices that are drawn of a curved outline."""
+_GREY = (128, 128, 128)
+_MAX_CHANNEL = 255
 
 
 def _primitive_marker(stamp: int, index: int, primitive: Primitive) -> Any:
-    outline = primitive.local_outline(64)
+    outline = primitive.local_outline(_OUTLINE_POINTS)
     text = json.dumps({"kind": str(primitive.kind), "size": primitive.sizes})
     pose = Pose2D(primitive.x, primitive.y, primitive.theta or 0.0)
     color = primitive.kind.row.color
@@ -352,7 +438,7 @@ def _primitive_marker(stamp: int, index: int, primitive: Primitive) -> Any:
 def _walls_marker(stamp: int, world: World) -> Any:
     ends = np.asarray(world.walls).reshape(-1, 2)
     text = json.dumps({"walls": world.to_json()["walls"]})
-    return _marker(stamp, "walls", 0, _LINE_LIST, Pose2D(), list(ends), text, (128, 128, 128))
+    return _marker(stamp, "walls", 0, _LINE_LIST, Pose2D(), list(ends), text, _GREY)
 
 
 def _marker(
@@ -365,7 +451,7 @@ def _marker(
     text: str,
     color: tuple[int, int, int],
 ) -> Any:
-    red, green, blue = (channel / 255 for channel in color)
+    red, green, blue = (channel / _MAX_CHANNEL for channel in color)
     return _new(
         "visualization_msgs/msg/Marker",
         header=_header(stamp, MAP_FRAME),
@@ -374,7 +460,7 @@ def _marker(
         type=shape,
         action=0,
         pose=_pose(pose),
-        scale=_new("geometry_msgs/msg/Vector3", x=0.01, y=0.0, z=0.0),
+        scale=_new("geometry_msgs/msg/Vector3", x=_LINE_WIDTH, y=0.0, z=0.0),
         color=_new("std_msgs/msg/ColorRGBA", r=red, g=green, b=blue, a=1.0),
         lifetime=_new("builtin_interfaces/msg/Duration", sec=0, nanosec=0),
         frame_locked=False,

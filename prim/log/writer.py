@@ -16,12 +16,19 @@ CHUNK_BYTES, CHUNK_MESSAGES = 256 * 1024, 600
 
 
 class LogWriter:
-    """Writes a ROS 2 MCAP log: chunked, zstd, CRCs on.
+    """Writes a ROS 2 MCAP log: chunked, zstd, with CRCs.
 
-    Until it is closed the log lies beside ``path`` with ``.part`` at its end. Every chunk is handed to the operating
-    system when it ends, and chunks are small, so that a recorder that is killed loses the last fraction of a second
-    and the rest can be read with ``--recover``. Where a chunk ends depends on the messages and not on the time, so
-    that the same messages make the same bytes. Raises OutputError where the place cannot be written.
+    Until it is closed, the log is written beside ``path``, with ``.part`` appended to its name. Every chunk is handed
+    to the operating system when it ends, and chunks are small, so that a recorder that is killed loses the last
+    fraction of a second and the rest can be read with ``--recover``. Where a chunk ends depends on the messages and
+    not on the time, so that the same messages make the same bytes.
+
+    Args:
+        path: The log.
+
+    Raises:
+        OutputError: The log cannot be written.
+
     """
 
     def __init__(self, path: Path) -> None:
@@ -62,21 +69,49 @@ class LogWriter:
             raise InterruptedRecordingError(f"interrupted: what was recorded until then is in {self.part}") from error
 
     def add_metadata(self, name: str, values: Mapping[str, str]) -> None:
-        """Adds a metadata record; call it before the first message."""
+        """Add a metadata record; call it before the first message.
+
+        Args:
+            name: Its name.
+            values: Its entries.
+
+        """
         self._writer.add_metadata(name, dict(values))
 
-    def attach(self, name: str, media_type: str, data: bytes, stamp: int) -> None:
-        """Adds an attachment; call it before the first message."""
+    def add_attachment(self, name: str, media_type: str, data: bytes, stamp: int) -> None:
+        """Add an attachment; call it before the first message.
+
+        Args:
+            name: Its name.
+            media_type: Its MIME type.
+            data: Its contents.
+            stamp: When it was made (ns).
+
+        """
         self._writer.add_attachment(stamp, stamp, name, media_type, data)
 
     def add_topic(self, topic: str, type_name: str, latched: bool = False) -> None:
-        """Announces a topic; the messages of a ``latched`` one reach late subscribers when it is played back."""
+        """Announce a topic.
+
+        Args:
+            topic: Its name.
+            type_name: The type of its messages.
+            latched: Whether its last message reaches late subscribers when the log is played back.
+
+        """
         schema = self._writer.register_schema(type_name, "ros2msg", message_definition(type_name).encode())
         profile = _LATCHED_QOS if latched else "[]"
         self._channels[topic] = self._writer.register_channel(topic, "cdr", schema, {"offered_qos_profiles": profile})
 
     def write(self, topic: str, stamp: int, data: bytes) -> None:
-        """Writes one CDR message, logged and published at ``stamp`` (ns)."""
+        """Write one message.
+
+        Args:
+            topic: Its topic, which was announced.
+            stamp: When it was logged and published (ns).
+            data: The message in CDR.
+
+        """
         try:
             self._writer.add_message(self._channels[topic], stamp, data, stamp)
             self._messages_in_chunk += 1
@@ -87,7 +122,7 @@ class LogWriter:
             raise OutputError(self.path, error) from error
 
     def flush(self) -> None:
-        """Ends the chunk that is being written and hands all there is to the operating system."""
+        """End the current chunk and hand everything to the operating system."""
         self._writer._Writer__finalize_chunk()  # type: ignore[attr-defined]  # nothing public ends a chunk
         self._file.flush()
         self._messages_in_chunk, self._bytes_in_chunk = 0, 0

@@ -32,7 +32,7 @@ def test_iou_of_shifted_squares() -> None:
     sizes=st.tuples(st.floats(0.05, 0.3), st.floats(0.05, 0.3)),
     moved=st.floats(-1e-8, 1e-8),
 )
-def test_what_all_but_agrees_overlaps_in_full(
+def test_nearly_coincident_shapes_overlap_in_full(
     kind: Kind, theta: float, sizes: tuple[float, float], moved: float
 ) -> None:
     shape = Primitive(kind, 0.3, -0.2, None if kind is Kind.CIRCLE else theta, sizes[: len(kind.sizes)]).canonical()
@@ -47,7 +47,7 @@ def test_triangles_that_differ_by_rounding_overlap_in_full() -> None:
     assert polygon_iou(one, other) > 0.9999
 
 
-def test_perfect_detections() -> None:
+def test_perfect_detections_have_no_errors() -> None:
     truth = [circle(0), square(1, 0.2)]
     errors = detection_errors(truth[::-1], truth)
     assert (errors.precision, errors.recall, errors.f1, errors.iou) == pytest.approx((1, 1, 1, 1))
@@ -55,7 +55,7 @@ def test_perfect_detections() -> None:
     assert {(pair.detection, pair.truth) for pair in errors.pairs} == {(0, 1), (1, 0)}
 
 
-def test_errors_are_the_papers_means_over_what_was_found() -> None:
+def test_errors_are_the_papers_means_over_true_positives() -> None:
     truth = [circle(0, 0.10), circle(1, 0.20), square(2, 0.2)]
     found = [circle(0.01, 0.11), circle(1.03, 0.20), circle(2, 0.1)]
     errors = detection_errors(found, truth)
@@ -68,13 +68,13 @@ def test_errors_are_the_papers_means_over_what_was_found() -> None:
     assert [(pair.detection, pair.truth) for pair in wrong] == [(2, 2)]
 
 
-def test_one_of_two_detections_of_one_thing_counts() -> None:
+def test_one_of_two_detections_of_one_primitive_is_a_true_positive() -> None:
     errors = detection_errors([circle(0.01), circle(0.0)], [circle(0.0)])
     assert (errors.precision, errors.recall) == (0.5, 1.0)
     assert errors.pairs[0].detection == 1
 
 
-def test_the_right_kind_goes_before_a_better_overlap() -> None:
+def test_an_equal_kind_is_preferred_to_a_larger_overlap() -> None:
     detections, truth = [square(0, 0.19), circle(0.03)], [circle(0.0)]
     assert polygon_iou(detections[0], truth[0]) > polygon_iou(detections[1], truth[0]) > 0.5
     pairs = match_primitives(detections, truth)
@@ -86,7 +86,7 @@ def test_nothing_found_or_nothing_there(detections: int, truth: int, f1: float) 
     assert detection_errors([circle(0)] * detections, [circle(0)] * truth).f1 == f1
 
 
-def test_map_scores_by_hand() -> None:
+def test_map_scores_agree_with_hand_counts() -> None:
     """A row of cells: free free free occupied hidden; the map is off by one cell and has one false alarm."""
     occupied = np.array([[False, False, False, False, True, False]])
     free = np.array([[True, True, True, False, False, False]])
@@ -105,7 +105,7 @@ def test_cells_that_no_beam_reaches_do_not_count() -> None:
     assert set(scores.to_json().values()) == {None}
 
 
-def test_an_all_unknown_map_finds_nothing() -> None:
+def test_an_unknown_map_has_no_recall() -> None:
     occupied = np.eye(4, dtype=bool)
     scores = map_scores(np.full((4, 4), 0.5, dtype=np.float32), occupied, ~occupied)
     assert scores.occupied_precision is None

@@ -1,5 +1,6 @@
 import json
 import math
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -9,25 +10,26 @@ from rosbags.typesys import Stores, get_typestore
 
 from prim import console
 from prim.errors import UsageError, WorldError
-from prim.log.mcap import LogReader
+from prim.log import open_log
 from prim.log.messages import (
     POSE_TYPE,
     SCAN_TOPIC,
     TRUE_POSE_TOPIC,
     decode_poses,
     decode_scan,
-    planar,
+    planar_pose,
 )
 from prim.se2 import Pose2D
 from prim.shapes import Kind, Primitive
 from prim.world import World
 from recorder.cli import app
 from recorder.sensors import Compass, Gps, Lidar
-from recorder.session import Session, SessionOptions, record
-from recorder.simulator import ROBOT_RADIUS, Simulator
+from recorder.session import Session, SessionOptions, record_session
+from recorder.simulator import Simulator, SimulatorOptions
 from recorder.world import WorldOptions, draw_world
 
 STORE = get_typestore(Stores.ROS2_JAZZY)
+ROBOT_RADIUS = SimulatorOptions().robot_radius
 
 
 def prim_record(*arguments: object) -> int:
@@ -36,25 +38,27 @@ def prim_record(*arguments: object) -> int:
 
 def test_the_same_options_write_the_same_bytes(tmp_path: Path) -> None:
     options = SessionOptions(seed=4, stops=(3, 3))
-    first, second = (record(tmp_path / name, options).path.read_bytes() for name in ("a.mcap", "b.mcap"))
+    first, second = (record_session(tmp_path / name, options).path.read_bytes() for name in ("a.mcap", "b.mcap"))
     assert first == second
-    assert record(tmp_path / "c.mcap", SessionOptions(seed=5, stops=(3, 3))).path.read_bytes() != first
+    assert record_session(tmp_path / "c.mcap", SessionOptions(seed=5, stops=(3, 3))).path.read_bytes() != first
 
 
 def test_more_noise_changes_neither_world_nor_poses(tmp_path: Path) -> None:
-    def seen(noise: float) -> tuple[World, list[Pose2D], np.ndarray]:
-        session = record(tmp_path / "a.mcap", SessionOptions(seed=4, stops=(3, 3), lidar=Lidar(noise_std=noise)))
-        with LogReader(session.path) as log:
+    def recorded(noise: float) -> tuple[World, list[Pose2D], np.ndarray]:
+        session = record_session(
+            tmp_path / "a.mcap", SessionOptions(seed=4, stops=(3, 3), lidar=Lidar(noise_std=noise))
+        )
+        with open_log(session.path) as log:
             poses = [
-                planar(p)
+                planar_pose(p)
                 for _, (p,) in log.decoded(log.topics[TRUE_POSE_TOPIC], lambda d: decode_poses(POSE_TYPE, d))
             ]
             ranges = np.array([scan.ranges for _, scan in log.decoded(log.topics[SCAN_TOPIC], decode_scan)])
         return session.world, poses, ranges
 
-    quiet, loud = seen(0.0), seen(0.1)
+    quiet, loud = recorded(0.0), recorded(0.1)
     assert quiet[:2] == loud[:2]
-    twice = seen(0.2)[2]
+    twice = recorded(0.2)[2]
     finite = np.isfinite(twice) & np.isfinite(loud[2])
     assert (twice - quiet[2])[finite] == pytest.approx(2 * (loud[2] - quiet[2])[finite], abs=1e-5)
 
@@ -95,16 +99,16 @@ def test_sizes_fill_the_papers_ranges() -> None:
     assert height.min() >= 0.06
 
 
-def test_worlds_that_cannot_be(tmp_path: Path) -> None:
+def test_worlds_that_do_not_fit_are_refused(tmp_path: Path) -> None:
     with pytest.raises(UsageError, match="do not fit"):
         draw_world(np.random.default_rng(0), WorldOptions((0.5, 0.5), per_kind=(9, 9)))
 
 
 def test_the_robot_keeps_clear_of_everything(quiet_session: Session) -> None:
     outlines = [shapely.Polygon(primitive.outline()) for primitive in quiet_session.world.primitives]
-    with LogReader(quiet_session.path) as log:
+    with open_log(quiet_session.path) as log:
         topic = log.topics[TRUE_POSE_TOPIC]
-        poses = [planar(pose) for _, (pose,) in log.decoded(topic, lambda d: decode_poses(POSE_TYPE, d))]
+        poses = [planar_pose(pose) for _, (pose,) in log.decoded(topic, lambda d: decode_poses(POSE_TYPE, d))]
     assert len(poses) == quiet_session.scans
     assert len(poses) + quiet_session.skipped == 100
     stops = {(round(10 * pose.x + 9.5) / 2, round(10 * pose.y + 9.5) / 2) for pose in poses}
@@ -115,7 +119,7 @@ def test_the_robot_keeps_clear_of_everything(quiet_session: Session) -> None:
 
 def test_stops_inside_a_primitive_or_touching_it_are_skipped() -> None:
     circle = Primitive(Kind.CIRCLE, 0.0, 0.0, None, (0.1,))
-    simulator = Simulator(World((2.0, 2.0), (circle,)).walled())
+    simulator = Simulator(World((2.0, 2.0), (circle,)).with_walls())
     assert not simulator.warp(Pose2D(0.0, 0.0))
     assert not simulator.warp(Pose2D(0.1 + ROBOT_RADIUS - 1e-3, 0.0))
     assert simulator.warp(Pose2D(0.1 + ROBOT_RADIUS + 1e-3, 0.0))
@@ -123,11 +127,11 @@ def test_stops_inside_a_primitive_or_touching_it_are_skipped() -> None:
 
 
 def test_exact_ranges_are_those_of_the_world(quiet_session: Session) -> None:
-    with LogReader(quiet_session.path) as log:
+    with open_log(quiet_session.path) as log:
         _, scan = next(log.decoded(log.topics[SCAN_TOPIC], decode_scan))
         topic = log.topics[TRUE_POSE_TOPIC]
         _, (stamped,) = next(log.decoded(topic, lambda d: decode_poses(POSE_TYPE, d)))
-    pose = planar(stamped)
+    pose = planar_pose(stamped)
     bearings = np.linspace(-3.14, 3.14, 500) + pose.theta
     exact = quiet_session.world.cast((pose.x, pose.y), np.column_stack((np.cos(bearings), np.sin(bearings))))
     assert scan.ranges == pytest.approx(exact, abs=2e-6)
@@ -147,7 +151,7 @@ def test_ranges_beyond_the_limits_follow_rep_117() -> None:
 
 @pytest.mark.parametrize(("noise", "std"), [(0.0, 0.0), (0.05, 0.05), (0.25, 0.25)])
 def test_noise_has_its_standard_deviation(noise: float, std: float) -> None:
-    world = World((4.0, 4.0)).walled()
+    world = World((4.0, 4.0)).with_walls()
     lidar = Lidar(rays=20_000, noise_std=noise)
     scan = lidar.measure(world, Pose2D(), 0, 0.1, np.random.default_rng(1))
     errors = scan.ranges - lidar.exact(world, Pose2D())
@@ -164,8 +168,8 @@ def test_gps_and_compass_noise() -> None:
     assert np.std(headings) == pytest.approx(0.05, rel=0.05)
 
 
-def test_the_log_describes_itself(quiet_session: Session) -> None:
-    with LogReader(quiet_session.path) as log:
+def test_the_log_holds_options_and_world(quiet_session: Session) -> None:
+    with open_log(quiet_session.path) as log:
         described = log.metadata["prim"]
         world = log.attachment("world.json")
         markers = next(iter(log.messages("/ground_truth/primitives"))).data
@@ -179,18 +183,31 @@ def test_the_log_describes_itself(quiet_session: Session) -> None:
     assert sorted(text["kind"] for text in texts if "kind" in text) == sorted(Kind)
 
 
-def test_a_world_from_a_file(tmp_path: Path) -> None:
-    world = World((3.0, 2.0), (Primitive(Kind.SQUARE, 1.0, 0.5, 0.3, (0.2,)),)).walled()
+def test_metadata_keep_their_keys_and_name_options_that_are_not_the_defaults(tmp_path: Path) -> None:
+    options = SessionOptions(motion="drive", duration=1.0, lidar=Lidar(rays=3), world=WorldOptions(per_kind=(0, 0)))
+    described = []
+    for name, chosen in (("a", options), ("b", replace(options, simulator=SimulatorOptions(tyre_friction=0.5)))):
+        with open_log(record_session(tmp_path / f"{name}.mcap", chosen).path) as log:
+            described.append(log.metadata["prim"])
+    common = {"version", "seed", "world", "world_file", "motion", "duration", "speed", "movable", "rate"}
+    assert described[0].keys() == common | {"lidar", "gps", "compass", "odometry"}
+    assert json.loads(described[0]["odometry"]) == {"metres": 0.05, "radians": math.radians(2)}
+    assert described[1].keys() == described[0].keys() | {"simulator"}
+    assert json.loads(described[1]["simulator"])["tyre_friction"] == 0.5
+
+
+def test_a_world_is_read_from_a_file(tmp_path: Path) -> None:
+    world = World((3.0, 2.0), (Primitive(Kind.SQUARE, 1.0, 0.5, 0.3, (0.2,)),)).with_walls()
     path = tmp_path / "world.json"
     path.write_text(json.dumps(world.to_json()))
     assert prim_record(tmp_path / "a.mcap", "--world", path, "--quiet") == 0
-    with LogReader(tmp_path / "a.mcap") as log:
+    with open_log(tmp_path / "a.mcap") as log:
         assert World.from_json(json.loads(log.attachment("world.json") or b"")) == world
     with pytest.raises(WorldError):
-        record(tmp_path / "b.mcap", SessionOptions(world_file=tmp_path / "none.json"))
+        record_session(tmp_path / "b.mcap", SessionOptions(world_file=tmp_path / "none.json"))
 
 
-def test_options_of_the_command_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_command_line_options_reach_the_log(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path = tmp_path / "a.mcap"
     code = prim_record(
         *(path, "--seed", 1, "--kinds", "circle,ellipse", "--per-kind", 2, "--no-walls", "--rays", 90, "--fov", 180),
@@ -199,7 +216,7 @@ def test_options_of_the_command_line(tmp_path: Path, capsys: pytest.CaptureFixtu
     )
     assert code == 0
     assert "noise 250 mm, 2 circles, 2 ellipses" in capsys.readouterr().out
-    with LogReader(path) as log:
+    with open_log(path) as log:
         scans = [scan for _, scan in log.decoded(log.topics[SCAN_TOPIC], decode_scan)]
         described = log.metadata["prim"]
         world = World.from_json(json.loads(log.attachment("world.json") or b""))
@@ -238,7 +255,7 @@ def test_options_of_the_command_line(tmp_path: Path, capsys: pytest.CaptureFixtu
         (["--nonsense"], "--nonsense"),
     ],
 )
-def test_impossible_options(
+def test_invalid_options_are_refused_by_name(
     tmp_path: Path, arguments: list[str], said: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert prim_record(tmp_path / "a.mcap", *arguments) == 2
@@ -249,7 +266,7 @@ def test_impossible_options(
     assert list(tmp_path.iterdir()) == []
 
 
-def test_unwritable_output(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_an_output_that_cannot_be_written_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert prim_record(tmp_path / "no" / "a.mcap") == 1
     assert prim_record(tmp_path) == 1
     assert capsys.readouterr().err.count("\n") == 2

@@ -8,8 +8,9 @@ from mcap_ros2.decoder import DecoderFactory
 from rosbags.typesys import Stores, get_typestore
 
 from prim.errors import InterruptedRecordingError, LogReadError, OutputError
-from prim.log.mcap import LogReader
+from prim.log import open_log
 from prim.log.messages import SCAN_TOPIC, SCAN_TYPE, decode_scan, encode_scan
+from prim.log.source import LogSource
 from prim.log.writer import LogWriter
 from prim.scan import Scan
 from recorder.session import Session
@@ -23,20 +24,20 @@ def write_log(path: Path, scans: int = 300, beams: int = 500) -> list[Scan]:
     ]
     with LogWriter(path) as log:
         log.add_metadata("prim", {"seed": "1"})
-        log.attach("world.json", "application/json", b"{}", 1)
+        log.add_attachment("world.json", "application/json", b"{}", 1)
         log.add_topic(SCAN_TOPIC, SCAN_TYPE)
         for scan in written:
             log.write(SCAN_TOPIC, scan.stamp, encode_scan(scan))
     return written
 
 
-def read_scans(path: Path, recover: bool = False) -> tuple[list[Scan], LogReader]:
-    with LogReader(path, recover=recover) as log:
+def read_scans(path: Path, recover: bool = False) -> tuple[list[Scan], LogSource]:
+    with open_log(path, recover=recover) as log:
         topic = log.topics[SCAN_TOPIC]
         return [scan for _, scan in log.decoded(topic, decode_scan)], log
 
 
-def test_round_trip(tmp_path: Path) -> None:
+def test_what_is_written_is_read(tmp_path: Path) -> None:
     written = write_log(tmp_path / "a.mcap")
     read, log = read_scans(tmp_path / "a.mcap")
     assert [scan.stamp for scan in read] == [scan.stamp for scan in written]
@@ -44,12 +45,12 @@ def test_round_trip(tmp_path: Path) -> None:
     assert log.metadata["prim"] == {"seed": "1"}
     assert log.topics[SCAN_TOPIC].messages == 300
     assert not (tmp_path / "a.mcap.part").exists()
-    with LogReader(tmp_path / "a.mcap") as again:
+    with open_log(tmp_path / "a.mcap") as again:
         assert again.attachment("world.json") == b"{}"
         assert again.attachment("other") is None
 
 
-def test_every_message_of_ours_decodes_elsewhere(quiet_session: Session) -> None:
+def test_other_libraries_decode_every_message(quiet_session: Session) -> None:
     """mcap-ros2-support reads each message by the schema in the log, rosbags by its own definitions."""
     store = get_typestore(Stores.ROS2_JAZZY)
     topics = set()
@@ -70,7 +71,7 @@ def test_every_message_of_ours_decodes_elsewhere(quiet_session: Session) -> None
     }
 
 
-def test_rosbags_reads_the_definitions_in_our_log(quiet_session: Session) -> None:
+def test_rosbags_reads_the_schemas_in_the_log(quiet_session: Session) -> None:
     from rosbags.typesys import get_types_from_msg
 
     with quiet_session.path.open("rb") as stream:
@@ -88,7 +89,7 @@ def cut(path: Path, share: float) -> Path:
 
 
 @pytest.mark.parametrize("share", [0.01, 0.3, 0.9, 0.9999])
-def test_a_truncated_log_says_so_and_can_be_salvaged(tmp_path: Path, share: float) -> None:
+def test_a_truncated_log_is_refused_and_can_be_recovered(tmp_path: Path, share: float) -> None:
     written = write_log(tmp_path / "a.mcap")
     part = cut(tmp_path / "a.mcap", share)
     with pytest.raises(LogReadError, match=r"truncated.*--recover"):
@@ -101,7 +102,7 @@ def test_a_truncated_log_says_so_and_can_be_salvaged(tmp_path: Path, share: floa
         assert "beyond byte" in log.lost[0]
 
 
-def test_a_damaged_chunk_is_found_and_the_others_salvaged(tmp_path: Path) -> None:
+def test_a_damaged_chunk_is_detected_and_the_others_are_recovered(tmp_path: Path) -> None:
     written = write_log(tmp_path / "a.mcap", scans=600)
     data = bytearray((tmp_path / "a.mcap").read_bytes())
     data[len(data) // 2] ^= 0xFF
@@ -113,7 +114,7 @@ def test_a_damaged_chunk_is_found_and_the_others_salvaged(tmp_path: Path) -> Non
     assert {scan.stamp for scan in read} <= {scan.stamp for scan in written}
     assert len(log.lost) == 1
     assert "a chunk of" in log.lost[0]
-    with LogReader(tmp_path / "b.mcap", recover=True) as again:
+    with open_log(tmp_path / "b.mcap", recover=True) as again:
         assert again.messages_lost == 600 - len(read)
 
 
@@ -125,7 +126,7 @@ def test_an_intact_log_is_the_same_when_recovered(tmp_path: Path) -> None:
     assert log.lost == []
 
 
-def test_a_damaged_summary_is_found(tmp_path: Path) -> None:
+def test_a_damaged_summary_is_detected(tmp_path: Path) -> None:
     write_log(tmp_path / "a.mcap")
     data = bytearray((tmp_path / "a.mcap").read_bytes())
     data[-100] ^= 0x01
@@ -135,7 +136,7 @@ def test_a_damaged_summary_is_found(tmp_path: Path) -> None:
     assert len(read_scans(tmp_path / "b.mcap", recover=True)[0]) == 300
 
 
-def test_a_recording_that_broke_off_leaves_what_was_written(tmp_path: Path) -> None:
+def test_an_interrupted_recording_keeps_what_was_written(tmp_path: Path) -> None:
     path = tmp_path / "a.mcap"
     with pytest.raises(InterruptedRecordingError, match=r"a\.mcap\.part"), LogWriter(path) as log:
         log.add_topic(SCAN_TOPIC, SCAN_TYPE)
@@ -157,31 +158,31 @@ def test_a_recording_that_broke_off_leaves_what_was_written(tmp_path: Path) -> N
         (b"\x89MCAP0\r\n" * 9, "truncated"),
     ],
 )
-def test_files_that_are_no_logs(tmp_path: Path, content: bytes, what: str) -> None:
+def test_other_files_are_refused_by_what_they_are(tmp_path: Path, content: bytes, what: str) -> None:
     path = tmp_path / "a.mcap"
     path.write_bytes(content)
     with pytest.raises(LogReadError, match=what) as error:
-        LogReader(path)
+        open_log(path)
     assert str(error.value).startswith(f"{path}: ")
     assert "\n" not in str(error.value)
 
 
-def test_folders(tmp_path: Path) -> None:
+def test_a_folder_is_read_where_it_holds_one_log(tmp_path: Path) -> None:
     with pytest.raises(LogReadError, match=r"without an \.mcap log"):
-        LogReader(tmp_path)
+        open_log(tmp_path)
     write_log(tmp_path / "bag_0.mcap", scans=3)
     assert len(read_scans(tmp_path)[0]) == 3
     write_log(tmp_path / "bag_1.mcap", scans=3)
     with pytest.raises(LogReadError, match=r"bag_0\.mcap, bag_1\.mcap"):
-        LogReader(tmp_path)
+        open_log(tmp_path)
 
 
-def test_missing_file(tmp_path: Path) -> None:
+def test_a_missing_file_is_refused(tmp_path: Path) -> None:
     with pytest.raises(LogReadError, match="No such file"):
-        LogReader(tmp_path / "none.mcap")
+        open_log(tmp_path / "none.mcap")
 
 
-def test_places_that_cannot_be_written(tmp_path: Path) -> None:
+def test_an_output_that_cannot_be_written_is_refused(tmp_path: Path) -> None:
     for path in (tmp_path / "no" / "folder.mcap", tmp_path):
         with pytest.raises(OutputError, match=re.escape(f"{path}: cannot write")):
             LogWriter(path)

@@ -23,7 +23,7 @@ from prim.log.messages import (
     encode_primitives,
     encode_scan,
     encode_transforms,
-    planar,
+    planar_pose,
 )
 from prim.scan import Scan
 from prim.se2 import Pose2D
@@ -58,7 +58,7 @@ def test_scans_round_trip(scan: Scan) -> None:
 
 
 @given(SCANS)
-def test_our_scans_are_rosbags_scans(scan: Scan) -> None:
+def test_rosbags_decodes_encoded_scans(scan: Scan) -> None:
     theirs = STORE.deserialize_cdr(encode_scan(scan), SCAN_TYPE)
     assert theirs.header.frame_id == scan.frame_id
     assert np.array_equal(theirs.ranges, scan.ranges, equal_nan=True)
@@ -68,7 +68,7 @@ def test_our_scans_are_rosbags_scans(scan: Scan) -> None:
 
 
 @given(SCANS, st.data())
-def test_cut_scans_are_refused(scan: Scan, data: st.DataObject) -> None:
+def test_truncated_scans_are_refused(scan: Scan, data: st.DataObject) -> None:
     whole = encode_scan(scan)
     cut = data.draw(st.integers(0, len(whole) - 5))  # the last four bytes count the intensities, which are not read
     with pytest.raises(ValueError, match=r"CDR|ends at byte|claims"):
@@ -76,7 +76,7 @@ def test_cut_scans_are_refused(scan: Scan, data: st.DataObject) -> None:
 
 
 @pytest.mark.parametrize("claimed", [1000, 2**31, 2**32 - 1])
-def test_counts_are_held_against_the_bytes_that_are_there(claimed: int) -> None:
+def test_a_count_beyond_the_end_is_refused(claimed: int) -> None:
     scan = Scan(0, "laser", 0.0, 0.1, 0.1, 5.0, np.ones(4, dtype=np.float32))
     whole = bytearray(encode_scan(scan))
     at = whole.index(struct.pack("<I", 4), 40)
@@ -95,13 +95,13 @@ def test_poses_round_trip(theta: float) -> None:
         (TF_TYPE, encode_transforms([(stamp, "odom", "base_link", pose)])),
     ):
         (stamped,) = decode_poses(type_name, data)
-        seen = planar(stamped)
+        seen = planar_pose(stamped)
         assert stamped.stamp == stamp
         assert (seen.x, seen.y) == (1.5, -2.5)
         assert math.cos(seen.theta - theta) == pytest.approx(1)
 
 
-def test_odometry_carries_the_covariance() -> None:
+def test_odometry_holds_the_covariance() -> None:
     pose = Pose2D(0, 0, 0, np.arange(9.0).reshape(3, 3))
     matrix = STORE.deserialize_cdr(encode_odometry(0, pose), ODOMETRY_TYPE).pose.covariance.reshape(6, 6)
     assert matrix[np.ix_((0, 1, 5), (0, 1, 5))].tolist() == pose.covariance.tolist()
@@ -121,7 +121,7 @@ def test_primitives_round_trip() -> None:
         Primitive(Kind.TRIANGLE, -0.1, 0.2, 5.0, (0.1, 0.2)),
         Primitive(Kind.ELLIPSE, -0.5, 0.2, 2.0, (0.2, 0.1)),
     )
-    stamp, primitives = decode_primitives(encode_primitives(7, World((2, 2), shapes).walled()))
+    stamp, primitives = decode_primitives(encode_primitives(7, World((2, 2), shapes).with_walls()))
     assert stamp == 7
     for primitive, shape in zip(primitives, shapes, strict=True):
         assert primitive.kind is shape.kind

@@ -1,0 +1,33 @@
+"""What can be chosen by name, on the command lines and in options.
+
+The standard library is all this module imports: a command line reads it before anything that takes time to load.
+"""
+
+from __future__ import annotations
+
+from enum import StrEnum
+
+
+class MapperName(StrEnum):
+    """The mappers."""
+
+    DET = "det"
+    PROB = "prob"
+    FORWARD = "forward"
+
+
+class SensorModelName(StrEnum):
+    """The inverse sensor models of ``prob``."""
+
+    EQ4 = "eq4"
+    GAUSSIAN = "gaussian"
+
+
+class PoseSourceName(StrEnum):
+    """The sources of poses."""
+
+    AUTO = "auto"
+    TRUTH = "truth"
+    TF = "tf"
+    ODOM = "odom"
+    FUSED = "fused"
