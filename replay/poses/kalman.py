@@ -1,64 +1,167 @@
-"""The compiled kernels of pose estimation: an extended Kalman filter, and the smoother that goes back over it.
+"""The compiled kernels of pose estimation: an extended Kalman filter and a Rauch-Tung-Striebel smoother.
 
 The state is the robot's x, y (m) and heading (rad, not wrapped) in the map frame. Time is cut into nodes; from one to
-the next the robot moves by a step that is measured in its own frame (Thrun, Burgard and Fox, Probabilistic Robotics,
-2005, chapter 5: odometry as control), whose variances grow with its ``way``. At a node there may be a position fix, a
-heading, and what a scan says about the pose. Covariances are kept as their six numbers xx, xy, xt, yy, yt, tt.
+the next the robot moves by a step that is measured in its own frame (Thrun, Burgard and Fox, Probabilistic
+Robotics, 2005, chapter 5: odometry as control), whose variances grow with the distance travelled. At a node there may
+be a position fix, a heading, and a scan's log-likelihood of the pose. Covariances are stored as the six numbers xx,
+xy, xt, yy, yt, tt of their upper triangles.
 
-filterpy's filter does the same at some 70 to 150 microseconds a node; these take below one (bench/poses.py), which is
-what lets the noise be found by filtering a log some fifty times. The tests hold them against filterpy.
+filterpy's filter does the same at some 70 to 150 microseconds a node; these take below one (bench/poses.py), which
+makes it affordable to estimate the noise by filtering a log some fifty times. The tests compare them with filterpy.
 """
 
 from __future__ import annotations
 
 import math
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
+from prim.arrays import FloatArray
 from prim.compiled import inline, kernel
 
-GATES = np.array([13.8, 10.8])
-"""A fix or heading whose squared normalised innovation is larger is not used: 1 in 1000 (chi squared, 2 and 1)."""
-
-PATIENCE = 20
-"""So many in a row are not used; then the filter takes it that the robot is elsewhere than it believed."""
-
-LEAST_VARIANCE = 1e-10
-"""What a step adds at least (m^2, rad^2), so that covariances stay invertible."""
-
-FIX_STD, HEADING_STD, METRES, RADIANS, BIAS = range(5)
-"""What the noise consists of: standard deviations of fixes (m) and headings (rad), of the odometry's place (m) and
-heading (rad) after one metre of way, and a constant that all headings are off by (rad)."""
+FIX_STD, HEADING_STD, TRANSLATION_STD, ROTATION_STD, HEADING_BIAS = range(5)
+"""Indices into the noise parameters (5,): standard deviations of fixes (m) and headings (rad), of the odometry's
+translation (m) and rotation (rad) after one metre, and the constant offset of all headings (rad)."""
 
 USED, REJECTED = 1, 2
+"""The gate's decision on a measurement; 0 where there is none."""
+
+
+class FilterState(NamedTuple):
+    """A Gaussian belief about the robot's pose, which the kernels update in place.
+
+    Attributes:
+        pose: (3,) x, y (m), heading (rad).
+        covariance: (6,).
+    """
+
+    pose: FloatArray
+    covariance: FloatArray
+
+
+class QuadraticTerms(NamedTuple):
+    """Second-order expansions of the scans' log-likelihoods, one a node; zeros where a node has no scan.
+
+    The log-likelihood of a pose that differs from the center by d is, up to a constant, s . d - d' I d / 2.
+
+    Attributes:
+        scores: The gradients s (N, 3).
+        information: The matrices I (N, 6).
+        centers: The poses (N, 3) that the expansions are made at.
+    """
+
+    scores: FloatArray
+    information: FloatArray
+    centers: FloatArray
+
+
+class Measurements(NamedTuple):
+    """What is measured at N nodes.
+
+    Attributes:
+        steps: Motions (N, 3) since the node before (or the initial state), in the robot's own frame there.
+        distances: How far the robot travelled in each step (N,) in m, which scales the process noise.
+        fixes: Positions of the antenna (N, 2) in m; NaN where there is none.
+        headings: Compass headings (N,) in rad; NaN where there is none.
+        scans: The scans' log-likelihoods; of N nodes, or of none at all.
+    """
+
+    steps: FloatArray
+    distances: FloatArray
+    fixes: FloatArray
+    headings: FloatArray
+    scans: QuadraticTerms
+
+
+class Gate(NamedTuple):
+    """When a measurement is rejected.
+
+    Attributes:
+        threshold: A measurement with a larger squared normalised innovation is rejected.
+        reset_after: After so many rejections in a row the state is reset to the measurement.
+    """
+
+    threshold: float
+    reset_after: int
+
+
+class FilterModel(NamedTuple):
+    """The parameters of the filter.
+
+    Attributes:
+        noise: The noise parameters (5,), indexed by FIX_STD and so on.
+        lever_arm: The antenna's position on the robot (2,) in m.
+        fix_gate: Of position fixes.
+        heading_gate: Of headings.
+        min_step_variance: Added to the process noise of each step (m^2, rad^2).
+    """
+
+    noise: FloatArray
+    lever_arm: FloatArray
+    fix_gate: Gate
+    heading_gate: Gate
+    min_step_variance: float
+
+
+class FilterOutput(NamedTuple):
+    """What the filter fills at N nodes.
+
+    Attributes:
+        poses: Poses (N, 3) after each node's measurements.
+        covariances: Their covariances (N, 6).
+        predicted_poses: Poses (N, 3) before them.
+        predicted_covariances: Their covariances (N, 6).
+        costs: Minus twice the log-likelihood (N,) of each node's fix and heading, up to a constant.
+        decisions: Whether each node's fix and heading (N, 2) were USED, REJECTED or absent (0).
+    """
+
+    poses: FloatArray
+    covariances: FloatArray
+    predicted_poses: FloatArray
+    predicted_covariances: FloatArray
+    costs: FloatArray
+    decisions: NDArray[np.int64]
+
+    @classmethod
+    def empty(cls, nodes: int) -> FilterOutput:
+        """Return uninitialised arrays for so many nodes."""
+        return cls(
+            np.empty((nodes, 3)),
+            np.empty((nodes, 6)),
+            np.empty((nodes, 3)),
+            np.empty((nodes, 6)),
+            np.empty(nodes),
+            np.empty((nodes, 2), np.int64),
+        )
 
 
 @inline
-def wrapped(angle: float) -> float:
-    """The angle (rad) in [-pi, pi)."""
+def _wrap(angle: float) -> float:
+    """Return the angle (rad) in [-pi, pi)."""
     return angle - 2 * math.pi * math.floor((angle + math.pi) / (2 * math.pi))
 
 
 @inline
-def corrected(state: Any, cov: Any, hx: float, hy: float, ht: float, variance: float, innovation: float) -> None:
-    """One scalar measurement, linear in the state with coefficients hx, hy, ht, brought into state and covariance."""
+def _update(pose: Any, cov: Any, hx: float, hy: float, ht: float, variance: float, innovation: float) -> None:
+    """Update the state with one scalar measurement that is linear in it with coefficients hx, hy, ht."""
     xx, xy, xt, yy, yt, tt = cov[0], cov[1], cov[2], cov[3], cov[4], cov[5]
     a = xx * hx + xy * hy + xt * ht
     b = xy * hx + yy * hy + yt * ht
     c = xt * hx + yt * hy + tt * ht
     spread = hx * a + hy * b + ht * c + variance
     gain = innovation / spread
-    state[0] += a * gain
-    state[1] += b * gain
-    state[2] += c * gain
+    pose[0] += a * gain
+    pose[1] += b * gain
+    pose[2] += c * gain
     cov[0], cov[1], cov[2] = xx - a * a / spread, xy - a * b / spread, xt - a * c / spread
     cov[3], cov[4], cov[5] = yy - b * b / spread, yt - b * c / spread, tt - c * c / spread
 
 
 @inline
-def inverse(cov: Any, out: Any) -> None:
-    """The inverse of a symmetric 3 x 3 matrix given by its six numbers."""
+def _invert(cov: Any, out: Any) -> None:
+    """Invert a symmetric 3 x 3 matrix given by its six numbers."""
     xx, xy, xt, yy, yt, tt = cov[0], cov[1], cov[2], cov[3], cov[4], cov[5]
     a, b, c = yy * tt - yt * yt, xt * yt - xy * tt, xy * yt - xt * yy
     scale = 1 / (xx * a + xy * b + xt * c)
@@ -67,175 +170,173 @@ def inverse(cov: Any, out: Any) -> None:
 
 
 @inline
-def moved(state: Any, cov: Any, step: Any, place: float, turn: float) -> None:
-    """The robot makes a step (in its own frame), which adds the variances ``place`` and ``turn``."""
-    cos, sin = math.cos(state[2]), math.sin(state[2])
+def _predict(pose: Any, cov: Any, step: Any, position_variance: float, heading_variance: float) -> None:
+    """Move the state by a step in the robot's frame and add the process noise."""
+    cos, sin = math.cos(pose[2]), math.sin(pose[2])
     dx, dy = cos * step[0] - sin * step[1], sin * step[0] + cos * step[1]
-    state[0] += dx
-    state[1] += dy
-    state[2] += step[2]
+    pose[0] += dx
+    pose[1] += dy
+    pose[2] += step[2]
     xx, xy, xt, yy, yt, tt = cov[0], cov[1], cov[2], cov[3], cov[4], cov[5]
-    cov[0] = xx - 2 * dy * xt + dy * dy * tt + place
+    cov[0] = xx - 2 * dy * xt + dy * dy * tt + position_variance
     cov[1] = xy + dx * xt - dy * yt - dx * dy * tt
     cov[2] = xt - dy * tt
-    cov[3] = yy + 2 * dx * yt + dx * dx * tt + place
+    cov[3] = yy + 2 * dx * yt + dx * dx * tt + position_variance
     cov[4] = yt + dx * tt
-    cov[5] = tt + turn
+    cov[5] = tt + heading_variance
 
 
 @inline
-def learn_from_scan(state: Any, cov: Any, slope: Any, information: Any, looked_from: Any, work: Any) -> None:
-    """What a scan says: its log-likelihood near the pose ``looked_from`` is slope . d - d' information d / 2."""
-    dx, dy, dt = state[0] - looked_from[0], state[1] - looked_from[1], wrapped(state[2] - looked_from[2])
+def _update_with_scan(pose: Any, cov: Any, score: Any, information: Any, center: Any, work: Any) -> None:
+    """Update the state with one row of QuadraticTerms, in information form."""
+    dx, dy, dt = pose[0] - center[0], pose[1] - center[1], _wrap(pose[2] - center[2])
     i = information
-    gx = slope[0] - i[0] * dx - i[1] * dy - i[2] * dt
-    gy = slope[1] - i[1] * dx - i[3] * dy - i[4] * dt
-    gt = slope[2] - i[2] * dx - i[4] * dy - i[5] * dt
-    inverse(cov, work)
+    gx = score[0] - i[0] * dx - i[1] * dy - i[2] * dt
+    gy = score[1] - i[1] * dx - i[3] * dy - i[4] * dt
+    gt = score[2] - i[2] * dx - i[4] * dy - i[5] * dt
+    _invert(cov, work)
     for k in range(6):
         work[k] += i[k]
-    inverse(work, cov)
-    state[0] += cov[0] * gx + cov[1] * gy + cov[2] * gt
-    state[1] += cov[1] * gx + cov[3] * gy + cov[4] * gt
-    state[2] += cov[2] * gx + cov[4] * gy + cov[5] * gt
+    _invert(work, cov)
+    pose[0] += cov[0] * gx + cov[1] * gy + cov[2] * gt
+    pose[1] += cov[1] * gx + cov[3] * gy + cov[4] * gt
+    pose[2] += cov[2] * gx + cov[4] * gy + cov[5] * gt
 
 
 @inline
-def take_fix(
-    state: Any, cov: Any, before: Any, x: float, y: float, lever: Any, variance: float, gate: float, missed: int
+def _update_with_fix(
+    pose: Any, cov: Any, predicted: Any, fix: Any, lever: Any, variance: float, gate: Gate, rejections: int
 ) -> tuple[float, int]:
-    """A position fix of an antenna that stands at ``lever`` on the robot: its cost, and how many in a row are missed.
+    """Update the state with a position fix of the antenna at the lever arm.
 
-    A robot that was carried elsewhere made a step that nobody measured: ``before``, the covariance that was
-    predicted, gets its variance as well, so that the smoother does not lay the jump on earlier steps. The cost is
-    minus twice the log-likelihood, but for a constant; that of one which is not used ends at the gate.
+    Returns its cost (minus twice the log-likelihood, up to a constant; capped at the gate where it is rejected) and
+    the number of rejections in a row. A reset is a motion that nobody measured: ``predicted``, the predicted
+    covariance (6,), is enlarged by it as well, so that the smoother does not spread the jump over earlier steps.
     """
-    cos, sin = math.cos(state[2]), math.sin(state[2])
+    x, y = fix[0], fix[1]
+    cos, sin = math.cos(pose[2]), math.sin(pose[2])
     lx, ly = cos * lever[0] - sin * lever[1], sin * lever[0] + cos * lever[1]
-    nx, ny = x - state[0] - lx, y - state[1] - ly
+    nx, ny = x - pose[0] - lx, y - pose[1] - ly
     xx = cov[0] - 2 * ly * cov[2] + ly * ly * cov[5] + variance
     xy = cov[1] + lx * cov[2] - ly * cov[4] - lx * ly * cov[5]
     yy = cov[3] + 2 * lx * cov[4] + lx * lx * cov[5] + variance
     determinant = xx * yy - xy * xy
     squared = (yy * nx * nx - 2 * xy * nx * ny + xx * ny * ny) / determinant
     size = math.log(determinant)
-    if squared > gate:
-        if missed < PATIENCE:
-            return gate + size, missed + 1
+    if squared > gate.threshold:
+        if rejections < gate.reset_after:
+            return gate.threshold + size, rejections + 1
         cov[0] += nx * nx
         cov[3] += ny * ny
-        before[0] += nx * nx
-        before[3] += ny * ny
-    corrected(state, cov, 1.0, 0.0, -ly, variance, nx)
-    ny = y - state[1] - (math.sin(state[2]) * lever[0] + math.cos(state[2]) * lever[1])
-    corrected(state, cov, 0.0, 1.0, lx, variance, ny)
-    return min(squared, gate) + size, 0
+        predicted[0] += nx * nx
+        predicted[3] += ny * ny
+    _update(pose, cov, 1.0, 0.0, -ly, variance, nx)
+    ny = y - pose[1] - (math.sin(pose[2]) * lever[0] + math.cos(pose[2]) * lever[1])
+    _update(pose, cov, 0.0, 1.0, lx, variance, ny)
+    return min(squared, gate.threshold) + size, 0
 
 
 @inline
-def take_heading(
-    state: Any, cov: Any, before: Any, heading: float, variance: float, gate: float, missed: int
+def _update_with_heading(
+    pose: Any, cov: Any, predicted: Any, heading: float, variance: float, gate: Gate, rejections: int
 ) -> tuple[float, int]:
-    """A heading: its cost, and how many in a row are missed (as take_fix)."""
-    off = wrapped(heading - state[2])
+    """Update the state with a heading; arguments and result are those of _update_with_fix."""
+    innovation = _wrap(heading - pose[2])
     spread = cov[5] + variance
-    squared = off * off / spread
+    squared = innovation * innovation / spread
     size = math.log(spread)
-    if squared > gate:
-        if missed < PATIENCE:
-            return gate + size, missed + 1
-        cov[5] += off * off
-        before[5] += off * off
-    corrected(state, cov, 0.0, 0.0, 1.0, variance, off)
-    return min(squared, gate) + size, 0
+    if squared > gate.threshold:
+        if rejections < gate.reset_after:
+            return gate.threshold + size, rejections + 1
+        cov[5] += innovation * innovation
+        predicted[5] += innovation * innovation
+    _update(pose, cov, 0.0, 0.0, 1.0, variance, innovation)
+    return min(squared, gate.threshold) + size, 0
 
 
 @kernel
-def run(
-    start: Any,
-    spread: Any,
-    steps: Any,
-    ways: Any,
-    fixes: Any,
-    headings: Any,
-    lever: Any,
-    noise: Any,
-    gates: Any,
-    scans: Any,
-    states: Any,
-    covs: Any,
-    predicted: Any,
-    predicted_covs: Any,
-    costs: Any,
-    verdicts: Any,
-) -> None:
-    """The filter over N nodes, from a pose ``start`` (3,) with covariance ``spread`` (6,).
+def run_filter(initial: FilterState, measurements: Measurements, model: FilterModel, output: FilterOutput) -> None:
+    """Run the extended Kalman filter over N nodes.
 
-    ``steps`` (N, 3): how the robot moved since the node before (or the start), in its own frame there; ``ways`` (N,):
-    how far that was; ``fixes`` (N, 2) and ``headings`` (N,): NaN where there is none; ``lever`` (2,): where the
-    antenna stands on the robot; ``noise`` (5,); ``gates`` (2,): a fix or heading with a larger squared normalised
-    innovation is not used; ``scans`` (N or 0, 12): what a scan says at each node (zeros: nothing): slope (3),
-    information (6), and the pose (3) that it was looked from.
-
-    Fills ``states``, ``predicted`` (N, 3) and ``covs``, ``predicted_covs`` (N, 6): after and before the node's
-    measurements; ``costs`` (N,): minus twice the log-likelihood of the node's fix and heading; ``verdicts`` (N, 2):
-    whether fix and heading were USED, REJECTED, or not there (0).
+    Args:
+        initial: The belief before the first node; left unchanged.
+        measurements: What is measured at the nodes.
+        model: The parameters of the filter.
+        output: Filled; arrays of N rows.
     """
-    state, cov, work = start.copy(), spread.copy(), np.empty(6)
+    # unpacked once: each access to a tuple's array costs an atomic reference count
+    steps, distances, noise, lever = measurements.steps, measurements.distances, model.noise, model.lever_arm
+    fixes, headings = measurements.fixes, measurements.headings
+    scores, information, centers = (
+        measurements.scans.scores,
+        measurements.scans.information,
+        measurements.scans.centers,
+    )
+    poses, covariances, costs, decisions = output.poses, output.covariances, output.costs, output.decisions
+    predicted_poses, predicted_covariances = output.predicted_poses, output.predicted_covariances
+    pose, cov, work = initial.pose.copy(), initial.covariance.copy(), np.empty(6)
     fix_variance, heading_variance = noise[FIX_STD] ** 2, noise[HEADING_STD] ** 2
-    lost_fixes = lost_headings = 0
+    fix_gate, heading_gate, min_variance = model.fix_gate, model.heading_gate, model.min_step_variance
+    fix_rejections = heading_rejections = 0
     for k in range(len(steps)):
-        place = ways[k] * noise[METRES] ** 2 + LEAST_VARIANCE
-        turn = ways[k] * noise[RADIANS] ** 2 + LEAST_VARIANCE
-        moved(state, cov, steps[k], place, turn)
-        predicted[k], predicted_covs[k] = state, cov
+        translation_variance = distances[k] * noise[TRANSLATION_STD] ** 2 + min_variance
+        rotation_variance = distances[k] * noise[ROTATION_STD] ** 2 + min_variance
+        _predict(pose, cov, steps[k], translation_variance, rotation_variance)
+        predicted_poses[k], predicted_covariances[k] = pose, cov
+        predicted = predicted_covariances[k]
         costs[k] = 0.0
-        verdicts[k] = 0
+        decisions[k] = 0
         if not math.isnan(fixes[k, 0]):
-            x, y, before = fixes[k, 0], fixes[k, 1], predicted_covs[k]
-            cost, missed = take_fix(state, cov, before, x, y, lever, fix_variance, gates[0], lost_fixes)
+            cost, fix_rejections = _update_with_fix(
+                pose, cov, predicted, fixes[k], lever, fix_variance, fix_gate, fix_rejections
+            )
             costs[k] += cost
-            verdicts[k, 0] = REJECTED if missed else USED
-            lost_fixes = missed
+            decisions[k, 0] = REJECTED if fix_rejections else USED
         if not math.isnan(headings[k]):
-            heading, before = headings[k] - noise[BIAS], predicted_covs[k]
-            cost, missed = take_heading(state, cov, before, heading, heading_variance, gates[1], lost_headings)
+            heading = headings[k] - noise[HEADING_BIAS]
+            cost, heading_rejections = _update_with_heading(
+                pose, cov, predicted, heading, heading_variance, heading_gate, heading_rejections
+            )
             costs[k] += cost
-            verdicts[k, 1] = REJECTED if missed else USED
-            lost_headings = missed
-        if len(scans):
-            learn_from_scan(state, cov, scans[k, :3], scans[k, 3:9], scans[k, 9:], work)
-        states[k], covs[k] = state, cov
+            decisions[k, 1] = REJECTED if heading_rejections else USED
+        if len(scores):
+            _update_with_scan(pose, cov, scores[k], information[k], centers[k], work)
+        poses[k], covariances[k] = pose, cov
 
 
 @kernel
-def smooth(states: Any, covs: Any, predicted: Any, predicted_covs: Any, gains: Any) -> None:
-    """Rauch, Tung and Striebel's backward pass over what :func:`run` filled; ``states`` and ``covs`` become smoothed.
+def smooth(filtered: FilterOutput, gains: Any) -> None:
+    """Run the backward pass of Rauch, Tung and Striebel (1965) over a filter's output.
 
-    Each node's estimate then rests on all measurements, the later ones too. ``gains`` (N, 3, 3) is filled: a node's
-    error goes with the next one's by so much.
+    Each node's estimate then rests on all measurements, the later ones too.
+
+    Args:
+        filtered: What :func:`run_filter` filled; poses and covariances become the smoothed ones.
+        gains: Filled (N, 3, 3): the smoother's gains, by which a node's error depends on the next one's.
     """
+    poses, covs = filtered.poses, filtered.covariances
+    predicted, predicted_covs = filtered.predicted_poses, filtered.predicted_covariances
     info = np.empty(6)
     f, p, gain = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
     change, product = np.empty((3, 3)), np.empty((3, 3))
-    for k in range(len(states) - 2, -1, -1):
-        dx, dy = predicted[k + 1, 0] - states[k, 0], predicted[k + 1, 1] - states[k, 1]
-        inverse(predicted_covs[k + 1], info)
-        square(covs[k], f)
-        for i in range(3):  # covariance times the transposed step
+    for k in range(len(poses) - 2, -1, -1):
+        dx, dy = predicted[k + 1, 0] - poses[k, 0], predicted[k + 1, 1] - poses[k, 1]
+        _invert(predicted_covs[k + 1], info)
+        _unpack(covs[k], f)
+        for i in range(3):  # covariance times the transposed Jacobian of the motion
             p[i, 0], p[i, 1], p[i, 2] = f[i, 0] - dy * f[i, 2], f[i, 1] + dx * f[i, 2], f[i, 2]
-        square(info, f)
-        multiply(p, f, gain)
+        _unpack(info, f)
+        _multiply(p, f, gain)
         gains[k] = gain
         for i in range(3):
-            off = 0.0
+            correction = 0.0
             for j in range(3):
-                off += gain[i, j] * (states[k + 1, j] - predicted[k + 1, j])
-            states[k, i] += off
+                correction += gain[i, j] * (poses[k + 1, j] - predicted[k + 1, j])
+            poses[k, i] += correction
         for i in range(6):
             info[i] = covs[k + 1, i] - predicted_covs[k + 1, i]
-        square(info, change)
-        multiply(gain, change, product)
+        _unpack(info, change)
+        _multiply(gain, change, product)
         n = 0
         for i in range(3):
             for j in range(i, 3):
@@ -247,26 +348,34 @@ def smooth(states: Any, covs: Any, predicted: Any, predicted_covs: Any, gains: A
 
 
 @kernel
-def common(states: Any, covs: Any, gains: Any, chosen: Any) -> Any:
-    """The covariance (3, 3) of the mean error of ``chosen`` (N,) smoothed poses, as a motion of the map's frame.
+def mean_frame_covariance(poses: Any, covariances: Any, gains: Any, selected: Any) -> Any:
+    """Compute the covariance of the map frame that the mean error of selected smoothed poses causes.
 
     An error of a pose moves what is seen from it: by the pose's own error at its place, turned about it. The motion
-    is given at the map's origin. Errors of different nodes belong together: that of node j given that of node k > j
-    is the product of the gains between them.
+    is given at the map's origin. Errors of different nodes are correlated: the regression of node j's error on
+    that of node k > j is the product of the gains between them.
+
+    Args:
+        poses: Smoothed poses (N, 3).
+        covariances: Their covariances (N, 6).
+        gains: The smoother's gains (N, 3, 3).
+        selected: Which nodes to average over (N,), bool.
+
+    Returns:
+        The covariance (3, 3) of the frame's x, y (m) and heading (rad) at its origin.
     """
     cov, lever, carried = np.empty((3, 3)), np.eye(3), np.zeros((3, 3))
     later, total = np.zeros((3, 3)), np.zeros((3, 3))
     count = 0
-    for k in range(len(states) - 1, -1, -1):
-        if k < len(states) - 1:
-            multiply(
-                gains[k], carried, later
-            )  # covariance of this error with the sum of later ones, moved to the origin
-        square(covs[k], cov)
-        lever[2, 0], lever[2, 1] = states[k, 1], -states[k, 0]  # transposed
-        if chosen[k]:
+    for k in range(len(poses) - 1, -1, -1):
+        if k < len(poses) - 1:
+            # covariance of this error with the sum of the later ones, moved to the origin
+            _multiply(gains[k], carried, later)
+        _unpack(covariances[k], cov)
+        lever[2, 0], lever[2, 1] = poses[k, 1], -poses[k, 0]  # transposed
+        if selected[k]:
             count += 1
-            multiply(cov, lever, carried)
+            _multiply(cov, lever, carried)
             for i in range(3):
                 for j in range(3):
                     for m in range(3):
@@ -282,16 +391,26 @@ def common(states: Any, covs: Any, gains: Any, chosen: Any) -> Any:
 
 
 @inline
-def square(six: Any, out: Any) -> None:
-    """The symmetric 3 x 3 matrix of six numbers."""
+def _unpack(six: Any, out: Any) -> None:
+    """Fill a symmetric 3 x 3 matrix from its six numbers."""
     out[0, 0], out[0, 1], out[0, 2] = six[0], six[1], six[2]
     out[1, 0], out[1, 1], out[1, 2] = six[1], six[3], six[4]
     out[2, 0], out[2, 1], out[2, 2] = six[2], six[4], six[5]
 
 
 @inline
-def multiply(a: Any, b: Any, out: Any) -> None:
-    """The product of two 3 x 3 matrices."""
+def _multiply(a: Any, b: Any, out: Any) -> None:
+    """Compute the product of two 3 x 3 matrices."""
     for i in range(3):
         for j in range(3):
             out[i, j] = a[i, 0] * b[0, j] + a[i, 1] * b[1, j] + a[i, 2] * b[2, j]
+
+
+def pack_symmetric(matrices: FloatArray) -> FloatArray:
+    """Return the six numbers (..., 6) of symmetric matrices (..., 3, 3)."""
+    return matrices[..., [0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2]].copy()
+
+
+def unpack_symmetric(six: FloatArray) -> FloatArray:
+    """Return the symmetric matrices (..., 3, 3) of six numbers each (..., 6)."""
+    return six[..., [0, 1, 2, 1, 3, 4, 2, 4, 5]].reshape(*six.shape[:-1], 3, 3)

@@ -1,314 +1,360 @@
-"""Poses corrected by the map: each scan is matched to a forward map of the scans, and all poses are smoothed anew.
+"""Poses corrected by the map: each scan is matched with a forward map of the scans, and all poses are smoothed anew.
 
 Poses that drift are first corrected scan by scan, as the map grows: a few Gauss-Newton steps each, from where the
-odometry says. Then in rounds: a map of all scans, what each of them says about its pose in it, and a smoother over
-all poses, odometry, fixes and headings. What a scan says is its rays' likelihood under the forward sensor model.
+odometry predicts. Then in rounds: a map of all scans, each scan's log-likelihood of its pose in it, and a smoother
+over all poses, odometry, fixes and headings. The log-likelihood is that of the scan's rays under the forward sensor
+model.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
-from dataclasses import replace
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from mapping.forward.mapper import ForwardMapper
-from mapping.forward.scan_likelihood import Beams, Likelihood, climb
+from mapping.forward.options import ForwardOptions
+from mapping.forward.scan_likelihood import ScanLikelihood, ScanRays, maximize_pose
 from prim.arrays import FloatArray, Stamps
 from prim.scan import PosedScan, Scan
-from prim.se2 import Pose2D, Trajectory, wrap_angles
+from prim.se2 import (
+    Pose2D,
+    Trajectory,
+    compose_covariances,
+    compose_poses,
+    frame_covariances,
+    relative_poses,
+    relative_steps,
+    wrap_angles,
+)
 from prim.world import Bounds
-from replay.poses.fusion import Fusion, PoseNoise, matrices_of, nodes_at, six_of, steps_between
-from replay.poses.kalman import LEAST_VARIANCE
-from replay.poses.localize import LaserPoses, carried, compose
+from replay.poses.fusion import Fusion
+from replay.poses.fusion_nodes import FusionNodes
+from replay.poses.fusion_options import SensorNoise
+from replay.poses.kalman import FilterState, QuadraticTerms, pack_symmetric, unpack_symmetric
+from replay.poses.laser_poses import LaserPoses
 
-RAYS = 180
-"""So many rays of a scan are matched at most."""
-
-CELLS = 1_000_000
-"""The growing map has cells of twice the resolution, or larger ones where it would have more."""
-
-ROUNDS = 12
-"""So many maps are made of all scans at most."""
-
-TRUST = np.diag([0.1**-2, 0.1**-2, math.radians(2) ** -2])
-"""How far a scan may lead its pose in a round: what is believed of it, in place of what other sensors say."""
-
-MOST_WIDENED, SURE = 8.0, 2.5
-"""The noise is widened so that the pose is within it at first: SURE standard deviations of the pose, and no more."""
-
-FIRST_ROUND = 4
-"""All scans so far are matched anew when they are so many, and each time that they have doubled."""
-
-LEAST_GAIN = 3e-3
-"""The rounds end when one raises the mean log-likelihood of a ray by less."""
-
-ADAPTS = 0.3
-"""How quickly the odometry is taken to be worse than was thought, where the scans say so."""
-
-UNTOLD = 10.0
-"""Steps between poses that do not drift are off by so many times what the poses are: they tell next to nothing."""
-
-MOST_WORSE = 1e4
-
-LEAST_RAYS = 10
-"""Scans with fewer rays on the map are not matched."""
-
-Posed = Callable[[LaserPoses], Iterator[PosedScan]]
+PosedScanSource = Callable[[LaserPoses], Iterable[PosedScan]]
+"""Yields the scans of a log with the poses that it is given."""
 
 
-def match(
+@dataclass(frozen=True)
+class ScanMatchingOptions:
+    """The numbers of scan matching; set by hand."""
+
+    max_rays: int = 180
+    """At most so many rays of a scan are matched, evenly spread."""
+
+    map_cells: int = 1_000_000
+    """The growing map has cells of twice the resolution, or larger ones where it would have more cells than this."""
+
+    max_rounds: int = 12
+    """At most so many maps are made of all scans."""
+
+    trust_position_std: float = 0.1
+    """How far a scan may move its pose in one round (m): standard deviation of a prior in place of the other
+    sensors."""
+
+    trust_heading_std: float = math.radians(2)
+    """How far a scan may turn its pose in one round (rad), likewise."""
+
+    max_widening: float = 8.0
+    """Coarse to fine: the range noise is multiplied by at most this factor."""
+
+    widening_deviations: float = 2.5
+    """The range noise is widened to so many standard deviations of the pose, so that the scan can be matched from
+    there."""
+
+    first_rematch: int = 4
+    """All scans so far are matched anew when they are so many, and each time that their number has doubled."""
+
+    min_gain: float = 3e-3
+    """The rounds end when one raises the mean log-likelihood of a ray by less (nats)."""
+
+    inflation_rate: float = 0.3
+    """Exponent by which the odometry's variances follow each scan's normalised correction."""
+
+    max_inflation: float = 1e4
+    """The odometry's variances are multiplied by at most this factor."""
+
+    free_step_factor: float = 10.0
+    """Steps between poses that do not drift have so many times the standard deviation of the poses: next to no
+    information."""
+
+    min_rays: int = 10
+    """Scans with fewer rays on the map are not matched."""
+
+    @property
+    def trust_information(self) -> FloatArray:
+        """The information (3, 3) of the prior on a pose in one round."""
+        return np.diag([self.trust_position_std**-2, self.trust_position_std**-2, self.trust_heading_std**-2])
+
+
+DEFAULTS = ScanMatchingOptions()
+
+
+def match_scans(
     poses: LaserPoses,
     stamps: Stamps,
-    posed: Posed,
+    source: PosedScanSource,
     resolution: float,
     noise_std: float | None = None,
-    noise: PoseNoise | None = None,
+    noise: SensorNoise | None = None,
     bounds: Bounds | None = None,
+    options: ScanMatchingOptions = DEFAULTS,
 ) -> LaserPoses:
-    """The laser's poses corrected by a map with cells of ``resolution`` (m), made of the scans themselves.
+    """Correct poses by a map that is made of the scans themselves.
 
-    It grows with the scans unless ``bounds`` are given.
+    Args:
+        poses: The laser's poses at N scans. Those that were not fused are taken for odometry; or, where ``noise``
+            has standard deviations of positions and headings, for poses that do not drift and have these errors.
+        stamps: The scans' stamps (N,) in ns.
+        source: Yields the scans with the poses that it is given.
+        resolution: The size of the map's cells (m).
+        noise_std: The range noise (m); None: estimated from the scans.
+        noise: The noise of poses that were not fused, as far as it is known.
+        bounds: The map's bounds; None: it grows with the scans.
+        options: Rays, rounds and tolerances.
 
-    ``posed`` gives the scans with the poses that it is given, ``stamps`` (N,) are all scans'. ``noise_std`` (m) is
-    the range noise where it is known. Poses that were not fused are taken for odometry of such ``noise``; or, where
-    that tells of fixes and headings, for poses that do not drift and are off by so much each.
+    Returns:
+        The corrected poses with their covariances.
     """
-    return Matcher(poses, stamps, posed, resolution, noise_std, noise, bounds).run()
+    return ScanMatcher(poses, stamps, source, resolution, noise_std, noise, bounds, options).run()
 
 
-class Matcher:
-    """The work of :func:`match`: poses of the robot at the nodes of a fusion, corrected by scans."""
+class ScanMatcher:
+    """The state of :func:`match_scans`, which has the arguments: poses of the robot at the nodes of a fusion."""
 
     def __init__(
         self,
         poses: LaserPoses,
         stamps: Stamps,
-        posed: Posed,
+        source: PosedScanSource,
         resolution: float,
         noise_std: float | None,
-        noise: PoseNoise | None,
+        noise: SensorNoise | None,
         bounds: Bounds | None,
+        options: ScanMatchingOptions,
     ) -> None:
-        self._poses, self._posed = poses, posed
+        self._poses, self._source, self._options = poses, source, options
         self._resolution, self._noise_std, self._bounds = resolution, noise_std, bounds
-        known = noise or PoseNoise()
-        if poses.fusion is not None:
-            self._fusion = poses.fusion
-        elif known.fixes is not None and known.headings is not None:
-            self._fusion = _steady(poses, stamps, known.fixes, known.headings)
-        else:
-            self._fusion = _drifting(poses, stamps, known)
-        self._drifts = not self._fusion.nodes.has_fixes.any()
+        self._fusion = poses.fusion or _fusion_of(poses, stamps, noise or SensorNoise(), options)
+        self._drifts = not self._fusion.nodes.has_fix.any()
         self._mounts = np.zeros_like(poses.poses) if poses.mounts is None or not poses.fusion else poses.mounts
         nodes = self._fusion.nodes.stamps
         self._node = np.searchsorted(nodes, np.clip(stamps, nodes[0], nodes[-1]))
         estimate = self._fusion.smoothed()
-        self._robot, self._spread = estimate.poses, six_of(estimate.covariances)
-        self._beams: dict[int, Beams] = {}
+        self._robot, self._covariances = estimate.poses, pack_symmetric(estimate.covariances)
+        self._rays: dict[int, ScanRays] = {}
         self._scans: list[PosedScan] = []
-        self._worse = 1.0
+        self._inflation = 1.0
 
     def run(self) -> LaserPoses:
-        """The corrected poses."""
+        """Match all scans; return the corrected poses."""
+        rounds = self._options.max_rounds
         if self._drifts:
-            self._as_the_map_grows()
-            self._in_rounds(ROUNDS)
+            self._match_incrementally()
+            self._match_in_rounds(rounds)
         else:
-            for posed in self._posed(self._poses):
-                self._keep(posed)
-            self._in_rounds(ROUNDS, SURE * math.sqrt(float(self._spread[:, [0, 3, 5]].sum(axis=1).mean())))
+            for posed in self._source(self._poses):
+                self._add(posed)
+            variance = float(self._covariances[:, [0, 3, 5]].sum(axis=1).mean())
+            self._match_in_rounds(rounds, self._options.widening_deviations * math.sqrt(variance))
         return self._corrected()
 
-    def _as_the_map_grows(self) -> None:
-        """Each scan matched to the map of those before it; all of them anew whenever they are twice as many."""
-        mapper = ForwardMapper(self._resolution, self._bounds, self._noise_std, stream_cells=CELLS)
-        state, spread = self._fusion.start
-        at, due = -1, FIRST_ROUND
-        for posed in sorted(self._posed(self._poses), key=lambda posed: int(self._node[posed.position])):
+    def _match_incrementally(self) -> None:
+        """Match each scan with the map of those before it, and all of them anew whenever their number has doubled."""
+        mapper = self._new_mapper()
+        state = self._fusion.initial_state
+        last, due = -1, self._options.first_rematch
+        for posed in sorted(self._source(self._poses), key=lambda posed: int(self._node[posed.position])):
             node, mount = int(self._node[posed.position]), self._mounts[posed.position]
-            if node > at:
-                state, spread = self._fusion.advance(at + 1, node + 1, state, spread, self._worse)
-                at = node
-            beams = self._keep(posed)
-            so_far = mapper.so_far()
-            if so_far is not None:
-                state, spread = self._settled(Likelihood.of(*so_far), beams, mount, state, spread)
-            self._robot[node] = state
-            for scan, pose in moved(posed, self._laser(posed.position)):
+            if node > last:
+                state = self._fusion.advance(last + 1, node + 1, state, self._inflation)
+                last = node
+            rays = self._add(posed)
+            streaming = mapper.streaming_map()
+            if streaming is not None:
+                state = self._match_one(ScanLikelihood.of(*streaming), rays, mount, state)
+            self._robot[node] = state.pose
+            for scan, pose in reposed(posed, self._laser(posed.position)):
                 mapper.update(scan, pose)
             if len(self._scans) == due:
-                self._in_rounds(1, nodes=at + 1)
-                mapper = self._kept()
-                mapper.settle()
-                state, spread = self._robot[at].copy(), self._spread[at].copy()
+                self._match_in_rounds(1, count=last + 1)
+                mapper = self._mapper_of_scans()
+                mapper.refit_streaming_map()
+                state = FilterState(self._robot[last].copy(), self._covariances[last].copy())
                 due *= 2
 
-    def _keep(self, posed: PosedScan) -> Beams:
-        """Remembers a scan, and some of its beams to be matched."""
-        beams = Beams.of(posed.pieces, posed.pose, RAYS, posed.position)
-        self._beams[posed.position] = beams
+    def _add(self, posed: PosedScan) -> ScanRays:
+        """Store a scan, and return some of its rays to be matched."""
+        rays = ScanRays.from_pieces(posed.pieces, posed.pose, self._options.max_rays, posed.position)
+        self._rays[posed.position] = rays
         self._scans.append(posed)
-        return beams
+        return rays
 
-    def _in_rounds(self, most: int, off: float = 0.0, nodes: int | None = None) -> None:
-        """Maps of the scans so far and poses by these maps, in turns, until the scans fit no better.
+    def _match_in_rounds(self, max_rounds: int, pose_error: float = 0.0, count: int | None = None) -> None:
+        """Alternate between a map of the scans so far and poses by this map, until the scans fit no better.
 
-        Poses may be ``off`` (m) at first: the noise is widened to that, so that scans find their places. ``nodes`` is
-        how many of the nodes the scans so far belong to; None: all.
+        Args:
+            max_rounds: The number of rounds at most.
+            pose_error: How far poses may be off at first (m): the range noise is widened to that, so that scans
+                find their places.
+            count: The number of nodes that the scans so far belong to; None: all.
         """
-        reached, widened = -math.inf, 0.0
-        before = self._robot, self._spread
-        for _ in range(most):
-            likelihood = self._map()
-            widened = widened or widening(off, likelihood)
-            fits, rows = self._looks(likelihood, widened)
-            if widened == 1.0 and fits < reached:
-                self._robot, self._spread = before
-            if widened == 1.0 and fits - reached < LEAST_GAIN:
+        best, widening = -math.inf, 0.0
+        before = self._robot, self._covariances
+        for _ in range(max_rounds):
+            fit = self._mapper_of_scans().fit()
+            likelihood = ScanLikelihood.of(fit, fit.noise)
+            widening = widening or self._widening(pose_error, likelihood)
+            mean, terms = self._match_all(likelihood, widening)
+            if widening == 1.0 and mean < best:
+                self._robot, self._covariances = before
+            if widening == 1.0 and mean - best < self._options.min_gain:
                 break
-            reached = fits if widened == 1.0 else reached
-            widened = max(widened / 2, 1.0)
-            before = self._robot.copy(), self._spread.copy()
-            self._smooth(rows, nodes)
+            best = mean if widening == 1.0 else best
+            widening = max(widening / 2, 1.0)
+            before = self._robot.copy(), self._covariances.copy()
+            self._smooth(terms, count)
 
-    def _smooth(self, rows: FloatArray, nodes: int | None) -> None:
-        estimate = self._fusion.smoothed(rows, self._worse, nodes)
-        self._robot[:nodes] = estimate.poses
-        self._spread[:nodes] = six_of(estimate.covariances)
-        self._worse = max(self._worse, self._misled(nodes))
+    def _smooth(self, terms: QuadraticTerms, count: int | None) -> None:
+        """Smooth the poses of the first ``count`` nodes with the scans' log-likelihoods."""
+        estimate = self._fusion.smoothed(terms, self._inflation, count)
+        self._robot[:count] = estimate.poses
+        self._covariances[:count] = pack_symmetric(estimate.covariances)
+        self._inflation = max(self._inflation, self._step_inflation(count))
 
-    def _misled(self, nodes: int | None) -> float:
-        """How many times the odometry's variances the corrections of its steps are."""
-        part = self._fusion.nodes.part(0, nodes)
-        if len(part.steps) < 2:
+    def _step_inflation(self, count: int | None) -> float:
+        """Return the mean squared correction of the odometry's steps, relative to their variances."""
+        nodes = self._fusion.nodes.subrange(0, count)
+        if len(nodes.steps) < 2:
             return 1.0
-        off = steps_between(self._robot[:nodes])[1:] - part.steps[1:]
-        off[:, 2] = wrap_angles(off[:, 2])
-        variances = part.ways[1:, None] * self._fusion.odometry_std**2 + LEAST_VARIANCE
-        return min(float((off**2 / variances).mean()), MOST_WORSE)
+        corrections = relative_steps(self._robot[:count])[1:] - nodes.steps[1:]
+        corrections[:, 2] = wrap_angles(corrections[:, 2])
+        variances = self._fusion.step_variances(nodes)[1:]
+        return min(float((corrections**2 / variances).mean()), self._options.max_inflation)
 
-    def _map(self) -> Likelihood:
-        """The map of the scans so far from where they are believed to have been taken."""
-        fit = self._kept().fit()
-        return Likelihood.of(fit, fit.noise)
+    def _new_mapper(self) -> ForwardMapper:
+        options = ForwardOptions(streaming_cells=self._options.map_cells)
+        return ForwardMapper(self._resolution, self._bounds, self._noise_std, options=options)
 
-    def _kept(self) -> ForwardMapper:
-        """A mapper that was given the scans so far from where they are believed to have been taken."""
-        mapper = ForwardMapper(self._resolution, self._bounds, self._noise_std, stream_cells=CELLS)
+    def _mapper_of_scans(self) -> ForwardMapper:
+        """Return a mapper that was given the scans so far at the current estimates of their poses."""
+        mapper = self._new_mapper()
         for posed in self._scans:
-            for scan, pose in moved(posed, self._laser(posed.position)):
-                mapper.keep(scan, pose)
+            for scan, pose in reposed(posed, self._laser(posed.position)):
+                mapper.accumulate(scan, pose)
         return mapper
 
     def _laser(self, position: int) -> Pose2D:
-        """The laser's pose at a scan, as believed."""
+        """Return the current estimate of the laser's pose at a scan."""
         return Pose2D(*self._robot[self._node[position]].tolist()) @ Pose2D(*self._mounts[position].tolist())
 
-    def _settled(
-        self, likelihood: Likelihood, beams: Beams, mount: FloatArray, prior: FloatArray, spread: FloatArray
-    ) -> tuple[FloatArray, FloatArray]:
-        """The likeliest pose by what was believed before (a pose, a covariance (6,)) and a scan; its covariance."""
-        believed = inverse_of(matrices_of(spread))
-        pose = prior.copy()
-        widened = widening(SURE * math.sqrt(spread[0] + spread[3] + spread[5]), likelihood)
+    def _match_one(
+        self, likelihood: ScanLikelihood, rays: ScanRays, mount: FloatArray, prior: FilterState
+    ) -> FilterState:
+        """Return the maximum a posteriori pose by the prior and one scan, coarse to fine, and its covariance."""
+        options, spread = self._options, prior.covariance
+        prior_information = _inverse(unpack_symmetric(spread))
+        pose = prior.pose.copy()
+        deviation = math.sqrt(spread[0] + spread[3] + spread[5])
+        widening = self._widening(options.widening_deviations * deviation, likelihood)
         while True:
-            pose, look = climb(likelihood, beams, mount, pose, prior, believed, widened)
-            if widened <= 1:
+            pose, score = maximize_pose(likelihood, rays, mount, pose, prior.pose, prior_information, widening)
+            if widening <= 1:
                 break
-            widened = max(widened / 2, 1.0)
-        if look.rays < LEAST_RAYS:
-            return prior, spread
-        after = inverse_of(believed + look.information)
-        off = pose - prior
-        surprise = float(off @ believed @ off + np.trace(believed @ after)) / 3
-        self._worse = min(max(self._worse * surprise**ADAPTS, 1.0), MOST_WORSE)
-        return pose, six_of(after)
+            widening = max(widening / 2, 1.0)
+        if score.rays < options.min_rays:
+            return prior
+        covariance = _inverse(prior_information + score.information)
+        change = pose - prior.pose
+        # 1 in expectation where the prior's covariance is right
+        surprise = float(change @ prior_information @ change + np.trace(prior_information @ covariance)) / 3
+        inflation = self._inflation * surprise**options.inflation_rate
+        self._inflation = min(max(inflation, 1.0), options.max_inflation)
+        return FilterState(pose, pack_symmetric(covariance))
 
-    def _looks(self, likelihood: Likelihood, widened: float) -> tuple[float, FloatArray]:
-        """Mean log-likelihood of a ray, and what each node's scans say about its pose (N, 12)."""
-        rows = np.zeros((len(self._robot), 12))
-        total, rays = 0.0, 0
+    def _widening(self, pose_error: float, likelihood: ScanLikelihood) -> float:
+        """Return the factor of the range noise with which a scan can be matched from a pose that is off (m)."""
+        return min(max(pose_error / likelihood.noise.std, 1.0), self._options.max_widening)
+
+    def _match_all(self, likelihood: ScanLikelihood, widening: float) -> tuple[float, QuadraticTerms]:
+        """Return the mean log-likelihood of a ray before, and the expansions at each node's best pose."""
+        count = len(self._robot)
+        terms = QuadraticTerms(np.zeros((count, 3)), np.zeros((count, 6)), np.zeros((count, 3)))
+        trust = self._options.trust_information
+        total, ray_count = 0.0, 0
         for posed in self._scans:
             node, mount = self._node[posed.position], self._mounts[posed.position]
-            beams, pose = self._beams[posed.position], self._robot[node]
-            total += likelihood.of_scan(beams, pose, mount, widened)
-            rays += len(beams.rays)
-            best, look = climb(likelihood, beams, mount, pose, pose, TRUST, widened)
-            if look.rays >= LEAST_RAYS:
-                row = rows[node]
-                row[:3] += look.slope - matrices_of(row[3:9]) @ (
-                    best - row[9:]
-                )  # another scan of this node looked elsewhere
-                row[3:9] += six_of(look.information)
-                row[9:] = best
-        return total / max(rays, 1), rows
+            rays, pose = self._rays[posed.position], self._robot[node]
+            total += likelihood.log_likelihood(rays, pose, mount, widening)
+            ray_count += len(rays.rays)
+            best, score = maximize_pose(likelihood, rays, mount, pose, pose, trust, widening)
+            if score.rays >= self._options.min_rays:
+                # an expansion of another scan at this node has another center: its score is moved to this one
+                information = unpack_symmetric(terms.information[node])
+                terms.scores[node] += score.score - information @ (best - terms.centers[node])
+                terms.information[node] += pack_symmetric(score.information)
+                terms.centers[node] = best
+        return total / max(ray_count, 1), terms
 
     def _corrected(self) -> LaserPoses:
-        """The laser's poses; as unsure as the smoother says, and as the map's own place is."""
+        """Return the laser's poses; their covariances are the smoother's, and that of the map's own frame."""
         robot = self._robot[self._node]
-        poses = compose(robot, self._mounts)
-        covariances = carried(matrices_of(self._spread[self._node]), robot, self._mounts)
-        covariances[:, [0, 1], [0, 1]] += (
-            self._resolution**2 / 12
-        )  # a map does not say where in its cells walls stand
+        poses = compose_poses(robot, self._mounts)
+        covariances = compose_covariances(unpack_symmetric(self._covariances[self._node]), robot, self._mounts)
+        # the variance of a surface's place within its cell, which the map does not resolve
+        covariances[:, [0, 1], [0, 1]] += self._resolution**2 / 12
         if self._poses.frame_covariance is not None:
-            covariances = covariances + moved_frame(self._poses.frame_covariance, poses)
-        ends = self._ends(poses)
-        return replace(self._poses, poses=poses, ends=ends, covariances=covariances, matched=True)
+            covariances = covariances + frame_covariances(self._poses.frame_covariance, poses)
+        return replace(
+            self._poses, poses=poses, end_poses=self._end_poses(poses), covariances=covariances, matched=True
+        )
 
-    def _ends(self, poses: FloatArray) -> FloatArray | None:
-        """The poses at the last beams, as far from those at the first as they were."""
-        if self._poses.ends is None:
+    def _end_poses(self, poses: FloatArray) -> FloatArray | None:
+        """Return the poses at the last beams, with the motion since the first ones unchanged."""
+        if self._poses.end_poses is None:
             return None
-        return compose(poses, between(self._poses.poses, self._poses.ends))
+        return compose_poses(poses, relative_poses(self._poses.poses, self._poses.end_poses))
 
 
-def moved(posed: PosedScan, pose: Pose2D) -> Iterator[tuple[Scan, Pose2D]]:
-    """The pieces of a scan whose first beam was taken from ``pose`` instead."""
+def reposed(posed: PosedScan, pose: Pose2D) -> Iterator[tuple[Scan, Pose2D]]:
+    """Move a scan's pieces to another pose.
+
+    Args:
+        posed: The scan.
+        pose: The laser's pose at the first beam.
+
+    Yields:
+        Each piece with its pose, unchanged relative to the first beam.
+    """
     back = Pose2D(posed.pose.x, posed.pose.y, posed.pose.theta).inverse()
     for scan, at in posed.pieces:
         yield scan, pose @ (back @ Pose2D(at.x, at.y, at.theta))
 
 
-def widening(off: float, likelihood: Likelihood) -> float:
-    """How many times the noise is taken where a pose may be ``off`` (m), so that a scan finds its place."""
-    return min(max(off / likelihood.noise.std, 1.0), MOST_WIDENED)
+def _fusion_of(poses: LaserPoses, stamps: Stamps, noise: SensorNoise, options: ScanMatchingOptions) -> Fusion:
+    """Return a fusion of poses that were not fused.
 
-
-def _drifting(poses: LaserPoses, stamps: Stamps, noise: PoseNoise) -> Fusion:
-    """Poses that were not fused taken for odometry: the laser's own, from the first one on."""
+    They are the steps of an odometry; where their noise is known, they are fixes and headings instead, and nothing is
+    known of the steps between them.
+    """
     trajectory = Trajectory.from_unsorted(stamps[poses.valid], poses.poses[poses.valid])
-    return Fusion(nodes_at(trajectory.stamps, trajectory, None, None), noise)
+    position_std, heading_std = noise.position_std, noise.heading_std
+    if position_std is None or heading_std is None:
+        return Fusion(FusionNodes.from_readings(trajectory.stamps, trajectory, None, None), noise)
+    fixes, headings = (trajectory.stamps, trajectory.poses[:, :2]), (trajectory.stamps, trajectory.poses[:, 2])
+    nodes = FusionNodes.from_readings(trajectory.stamps, trajectory, fixes, headings)
+    steps = options.free_step_factor * position_std, options.free_step_factor * heading_std
+    return Fusion(
+        replace(nodes, distances=np.ones(len(trajectory))), SensorNoise(position_std, heading_std, *steps, 0.0)
+    )
 
 
-def _steady(poses: LaserPoses, stamps: Stamps, metres: float, radians: float) -> Fusion:
-    """Poses that do not drift but are each off by so much; of the way between two of them nothing else is known."""
-    trajectory = Trajectory.from_unsorted(stamps[poses.valid], poses.poses[poses.valid])
-    fixes, turns = (trajectory.stamps, trajectory.poses[:, :2]), (trajectory.stamps, trajectory.poses[:, 2])
-    nodes = replace(nodes_at(trajectory.stamps, trajectory, fixes, turns), ways=np.ones(len(trajectory)))
-    noise = PoseNoise(metres, radians, UNTOLD * metres, UNTOLD * radians, 0.0)
-    return Fusion(nodes, noise)
-
-
-def between(poses: FloatArray, others: FloatArray) -> FloatArray:
-    """Poses (N, 3) as seen from others (N, 3): ``others`` in the frames of ``poses``."""
-    change = others - poses
-    cos, sin = np.cos(poses[:, 2]), np.sin(poses[:, 2])
-    x, y = cos * change[:, 0] + sin * change[:, 1], cos * change[:, 1] - sin * change[:, 0]
-    return np.column_stack((x, y, wrap_angles(change[:, 2])))
-
-
-def moved_frame(covariance: FloatArray, poses: FloatArray) -> FloatArray:
-    """What poses (N, 3) are unsure by (N, 3, 3) where their map's frame is unsure by ``covariance`` at its origin."""
-    turn = np.broadcast_to(np.eye(3), (len(poses), 3, 3)).copy()
-    turn[:, 0, 2], turn[:, 1, 2] = -poses[:, 1], poses[:, 0]
-    moved_by: FloatArray = turn @ covariance @ turn.transpose(0, 2, 1)
-    return moved_by
-
-
-def inverse_of(matrix: FloatArray) -> FloatArray:
-    """The inverse in double precision."""
+def _inverse(matrix: FloatArray) -> FloatArray:
+    """Return the inverse of a matrix in double precision."""
     inverse: FloatArray = np.linalg.inv(matrix).astype(float)
     return inverse

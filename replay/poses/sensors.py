@@ -1,4 +1,4 @@
-"""What a log's sensors say about the robot's motion: odometry, position fixes and headings."""
+"""The motion sensors of a log: odometry, position fixes and compass headings."""
 
 from __future__ import annotations
 
@@ -12,140 +12,256 @@ import numpy as np
 
 from prim.arrays import FloatArray, Stamps
 from prim.errors import LogReadError
-from prim.log.mcap import LogReader
 from prim.log.messages import (
     FIX_TYPE,
+    ODOMETRY_TYPE,
     POINT_TYPE,
+    POSE_DECODERS,
+    POSE_TYPE,
+    POSE_WITH_COVARIANCE_TYPE,
+    TRUE_POSE_TOPIC,
     VECTOR_TYPE,
     StampedPose,
     StampedVector,
     decode_fix,
     decode_poses,
     decode_vector,
-    planar,
+    planar_pose,
 )
-from prim.log.source import Topic
+from prim.log.source import LogSource, Topic
 from prim.se2 import Trajectory
 
 GPS_TYPES = (POINT_TYPE, FIX_TYPE)
 COMPASS_TYPES = (VECTOR_TYPE,)
 GPS_NAMES = ("gps", "gnss", "fix", "navsat")
 COMPASS_NAMES = ("compass", "north")
-"""Points and vectors on topics with such a word in their names are taken for a GPS's and a compass's unasked."""
+"""Points and vectors are those of a GPS and a compass where the topic has such a word in its name."""
 
-EQUATOR, FLATTENING = 6_378_137.0, 1 / 298.257223563
+EQUATORIAL_RADIUS, FLATTENING = 6_378_137.0, 1 / 298.257223563
 """The Earth's radius at the equator (m) and its flattening (WGS 84)."""
 
 
 @dataclass(frozen=True)
-class Odometry:
-    """The robot's poses on a topic: ``base`` is its frame, empty where the messages do not say."""
+class OdometryLog:
+    """The robot's poses on one topic.
+
+    Attributes:
+        topic: The topic's name.
+        trajectory: The poses over time.
+        base_frame: The robot's frame; empty where the messages do not name it.
+        skipped: How many poses cannot be used.
+    """
 
     topic: str
     trajectory: Trajectory
-    base: str
-    unusable: int = 0
+    base_frame: str
+    skipped: int = 0
 
     @property
     def notes(self) -> tuple[str, ...]:
         """What a user should know."""
-        if not self.unusable:
+        if not self.skipped:
             return ()
-        return (f"{self.topic}: {self.unusable} poses that are not finite or have no rotation were skipped",)
+        return (f"{self.topic}: {self.skipped} poses that are not finite or have no rotation were skipped",)
 
 
 @dataclass(frozen=True)
-class Readings:
-    """What a sensor measured, by rising ``stamps`` (N,): ``values`` (N, 3), metres or the direction of north."""
+class SensorReadings:
+    """What a GPS or a compass measured.
+
+    Attributes:
+        topic: The topic's name.
+        stamps: (N,) ns, strictly rising.
+        values: (N, 3): positions in m, or vectors that point north.
+        frame_id: The sensor's frame.
+        skipped: How many messages cannot be used.
+    """
 
     topic: str
     stamps: Stamps
     values: FloatArray
     frame_id: str
-    unusable: int = 0
+    skipped: int = 0
 
     @property
     def notes(self) -> tuple[str, ...]:
         """What a user should know."""
-        return (f"{self.topic}: {self.unusable} messages without a usable value were skipped",) * bool(self.unusable)
+        return (f"{self.topic}: {self.skipped} messages without a usable value were skipped",) * bool(self.skipped)
 
 
 @dataclass(frozen=True)
-class Sensed:
-    """What poses can be fused from; None for what a log does not have. ``notes``: what a user should know."""
+class SensorLogs:
+    """What poses can be fused from.
 
-    odometry: Odometry | None
-    gps: Readings | None
-    compass: Readings | None
+    Attributes:
+        odometry: The odometry, if any.
+        gps: The position fixes, if any.
+        compass: The north vectors, if any.
+        notes: What a user should know.
+    """
+
+    odometry: OdometryLog | None
+    gps: SensorReadings | None
+    compass: SensorReadings | None
     notes: tuple[str, ...] = ()
 
     @property
     def topics(self) -> str:
-        """The topics, for people."""
-        return ", ".join(reading.topic for reading in (self.odometry, self.gps, self.compass) if reading)
+        """The topics, as a list for people."""
+        return ", ".join(sensor.topic for sensor in (self.odometry, self.gps, self.compass) if sensor)
 
 
-def read_sensors(log: LogReader, odometry: Topic | None, gps: Topic | None, compass: Topic | None) -> Sensed:
-    """What is on the sensors' topics. Raises LogReadError."""
-    moved = read_odometry(log, odometry) if odometry else None
+def read_sensors(log: LogSource, odometry: Topic | None, gps: Topic | None, compass: Topic | None) -> SensorLogs:
+    """Read the sensors' topics.
+
+    Args:
+        log: The log.
+        odometry: The topic of odometry, if any.
+        gps: The topic of position fixes, if any.
+        compass: The topic of north vectors, if any.
+
+    Returns:
+        The sensors that have usable readings.
+
+    Raises:
+        LogReadError: A message is damaged, or no pose of the odometry can be used.
+    """
+    poses = read_odometry(log, odometry) if odometry else None
     fixes = read_gps(log, gps) if gps else None
     norths = read_compass(log, compass) if compass else None
-    notes = sum((reading.notes for reading in (moved, fixes, norths) if reading), ())
-    return Sensed(
-        moved,
+    notes = sum((sensor.notes for sensor in (poses, fixes, norths) if sensor), ())
+    return SensorLogs(
+        poses,
         fixes if fixes and len(fixes.stamps) else None,
         norths if norths and len(norths.stamps) else None,
         notes,
     )
 
 
-def is_usable(pose: StampedPose) -> bool:
-    """Whether a pose is finite and has a rotation."""
+def is_valid_pose(pose: StampedPose) -> bool:
+    """Return whether a pose is finite and has a rotation."""
     return bool(np.isfinite((*pose.translation, *pose.rotation)).all() and np.linalg.norm(pose.rotation) > 1e-3)
 
 
-def read_odometry(log: LogReader, topic: Topic) -> Odometry:
-    """The poses on a topic, sorted by stamp. Raises LogReadError where none can be used."""
+def find_pose_topic(log: LogSource, requested: str | None = None) -> Topic | None:
+    """Find the topic of the robot's poses: the requested one, else the only Odometry, else the only other one.
+
+    Args:
+        log: The log.
+        requested: The topic's name; None: found by type.
+
+    Returns:
+        The topic; None where there is none.
+
+    Raises:
+        LogReadError: The requested topic has no poses, or several topics fit.
+    """
+    poses = log.of_type(ODOMETRY_TYPE, POSE_TYPE, POSE_WITH_COVARIANCE_TYPE)
+    topics = [topic for topic in poses if topic.name != TRUE_POSE_TOPIC or topic.name == requested]
+    names = ", ".join(f"{topic.name} ({topic.type})" for topic in topics) or "none"
+    if requested is not None:
+        chosen = [topic for topic in topics if topic.name == requested]
+        if not chosen:
+            there = log.topics.get(requested)
+            what = f"no {'messages' if there and there.type in POSE_DECODERS else 'poses'} on {requested}"
+            raise LogReadError(log.path, what, f"topics with poses: {names}")
+        return chosen[0]
+    odometry = [topic for topic in topics if topic.type == ODOMETRY_TYPE] or topics
+    if len(odometry) > 1:
+        what = f"poses on {len(odometry)} topics: {', '.join(topic.name for topic in odometry)}"
+        raise LogReadError(log.path, what, "choose one with --odom-topic")
+    return odometry[0] if odometry else None
+
+
+def find_odometry(log: LogSource, requested: str | None = None) -> Topic | None:
+    """Find the topic of odometry: the requested one, else the only Odometry; a PoseStamped may be anything.
+
+    Args:
+        log: The log.
+        requested: The topic's name; None: found by type.
+
+    Returns:
+        The topic; None where there is none.
+
+    Raises:
+        LogReadError: The requested topic has no poses, or several topics fit.
+    """
+    topic = find_pose_topic(log, requested)
+    return topic if topic and (topic.type == ODOMETRY_TYPE or requested) else None
+
+
+def read_odometry(log: LogSource, topic: Topic) -> OdometryLog:
+    """Read the poses on a topic.
+
+    Args:
+        log: The log.
+        topic: A topic of poses of any type.
+
+    Returns:
+        The poses by rising stamp.
+
+    Raises:
+        LogReadError: A message is damaged, or no pose can be used.
+    """
     stamps: list[int] = []
     poses: list[tuple[float, float, float]] = []
-    base = ""
-    unusable = 0
+    base_frame = ""
+    skipped = 0
     for _, messages in log.decoded(topic, partial(decode_poses, topic.type)):
         for message in messages:
-            if is_usable(message):
-                pose = planar(message)
+            if is_valid_pose(message):
+                pose = planar_pose(message)
                 stamps.append(message.stamp)
                 poses.append((pose.x, pose.y, pose.theta))
-                base = message.child_frame_id.lstrip("/")
+                base_frame = message.child_frame_id.lstrip("/")
             else:
-                unusable += 1
+                skipped += 1
     if not stamps:
         raise LogReadError(log.path, f"{topic.name} has no usable pose", "give another --pose")
-    return Odometry(topic.name, Trajectory.from_unsorted(stamps, poses), base, unusable)
+    return OdometryLog(topic.name, Trajectory.from_unsorted(stamps, poses), base_frame, skipped)
 
 
-def find_gps(log: LogReader, wanted: str | None = None) -> Topic | None:
-    """The topic of position fixes: the one asked for, or the one whose type and name say so.
+def find_gps(log: LogSource, requested: str | None = None) -> Topic | None:
+    """Find the topic of position fixes.
 
-    Raises LogReadError where the one asked for is not there, or there are several.
+    Args:
+        log: The log.
+        requested: The topic's name; None: found by type and name.
+
+    Returns:
+        The topic; None where there is none.
+
+    Raises:
+        LogReadError: The requested topic is missing, or several topics fit.
     """
-    return _find(log, GPS_TYPES, GPS_NAMES, wanted, "--gps-topic")
+    return _find(log, GPS_TYPES, GPS_NAMES, requested, "--gps-topic")
 
 
-def find_compass(log: LogReader, wanted: str | None = None) -> Topic | None:
-    """The topic of north vectors, as :func:`find_gps`."""
-    return _find(log, COMPASS_TYPES, COMPASS_NAMES, wanted, "--compass-topic")
+def find_compass(log: LogSource, requested: str | None = None) -> Topic | None:
+    """Find the topic of north vectors.
+
+    Args:
+        log: The log.
+        requested: The topic's name; None: found by type and name.
+
+    Returns:
+        The topic; None where there is none.
+
+    Raises:
+        LogReadError: The requested topic is missing, or several topics fit.
+    """
+    return _find(log, COMPASS_TYPES, COMPASS_NAMES, requested, "--compass-topic")
 
 
 def _find(
-    log: LogReader, types: Sequence[str], names: Iterable[str], wanted: str | None, option: str
+    log: LogSource, types: Sequence[str], names: Iterable[str], requested: str | None, option: str
 ) -> Topic | None:
     topics = log.of_type(*types)
-    if wanted is not None:
-        chosen = [topic for topic in topics if topic.name == wanted]
+    if requested is not None:
+        chosen = [topic for topic in topics if topic.name == requested]
         if not chosen:
             there = ", ".join(f"{topic.name} ({topic.type})" for topic in topics) or "none"
-            raise LogReadError(log.path, f"no {' or '.join(types)} on {wanted}", f"topics of that type: {there}")
+            raise LogReadError(log.path, f"no {' or '.join(types)} on {requested}", f"topics of that type: {there}")
         return chosen[0]
     likely = [topic for topic in topics if not set(names).isdisjoint(re.split(r"[/_]", topic.name.lower()))]
     if len(likely) > 1:
@@ -154,62 +270,92 @@ def _find(
     return likely[0] if likely else None
 
 
-def read_gps(log: LogReader, topic: Topic) -> Readings:
-    """Position fixes (m): points as they are, satellites' as east and north of the first. Raises LogReadError."""
+def read_gps(log: LogSource, topic: Topic) -> SensorReadings:
+    """Read position fixes.
+
+    Args:
+        log: The log.
+        topic: A topic of points, which are read as they are, or of satellite fixes.
+
+    Returns:
+        Positions in m; those of satellite fixes east and north of the first one.
+
+    Raises:
+        LogReadError: A message is damaged.
+    """
     satellites = topic.type == FIX_TYPE
     readings = _read(
         log, topic, decode_fix if satellites else decode_vector, lambda fix: math.isfinite(fix.x + fix.y)
     )
     if not satellites or not len(readings.stamps):
         return readings
-    return replace(readings, values=flattened(readings.values))
+    return replace(readings, values=geodetic_to_plane(readings.values))
 
 
-def read_compass(log: LogReader, topic: Topic) -> Readings:
-    """Vectors that point north, in the sensor's frame. Raises LogReadError."""
+def read_compass(log: LogSource, topic: Topic) -> SensorReadings:
+    """Read the vectors of a compass.
+
+    Args:
+        log: The log.
+        topic: A topic of vectors.
+
+    Returns:
+        Vectors that point north, in the sensor's frame.
+
+    Raises:
+        LogReadError: A message is damaged.
+    """
     return _read(log, topic, decode_vector, lambda north: 1e-9 < math.hypot(north.x, north.y, north.z) < math.inf)
 
 
 def _read(
-    log: LogReader, topic: Topic, decode: Callable[[bytes], StampedVector], accepts: Callable[[StampedVector], bool]
-) -> Readings:
-    """The usable values of a topic by rising stamp; of those with the same stamp the last."""
+    log: LogSource, topic: Topic, decode: Callable[[bytes], StampedVector], accepts: Callable[[StampedVector], bool]
+) -> SensorReadings:
+    """Read the usable values of a topic by rising stamp; of those with the same stamp the last remains."""
     values: dict[int, tuple[float, float, float]] = {}
     frame_id = ""
-    unusable = 0
+    skipped = 0
     for _, message in log.decoded(topic, decode):
         if accepts(message):
             values[message.stamp] = message.x, message.y, message.z
             frame_id = message.frame_id.lstrip("/")
         else:
-            unusable += 1
+            skipped += 1
     stamps = sorted(values)
     ordered = np.array([values[stamp] for stamp in stamps]).reshape(-1, 3)
-    return Readings(topic.name, np.array(stamps, dtype=np.int64), ordered, frame_id, unusable)
+    return SensorReadings(topic.name, np.array(stamps, dtype=np.int64), ordered, frame_id, skipped)
 
 
-def headings(readings: Readings, rotation: FloatArray) -> FloatArray:
-    """The robot's headings (N,) in rad by a compass that is turned by ``rotation`` (3, 3); north is the map's +y."""
+def compass_headings(readings: SensorReadings, rotation: FloatArray) -> FloatArray:
+    """Compute the robot's headings from a compass; north is the map's +y.
+
+    Args:
+        readings: N vectors that point north.
+        rotation: The compass's rotation on the robot (3, 3).
+
+    Returns:
+        Headings (N,) in rad.
+    """
     north = readings.values @ rotation.T
     return np.arctan2(north[:, 0], north[:, 1])
 
 
-def flattened(places: FloatArray) -> FloatArray:
-    """Latitudes and longitudes (N, 2 or more) in degrees as metres (N, 2) east and north of the first one.
+def geodetic_to_plane(coordinates: FloatArray) -> FloatArray:
+    """Project latitudes and longitudes (N, 2 or more) in degrees to metres (N, 2) east and north of the first one.
 
-    On the plane that touches the ellipsoid there: within ten kilometres distances are right to a centimetre.
+    The plane touches the ellipsoid there: within ten kilometres distances are right to a centimetre.
     """
-    squared = FLATTENING * (2 - FLATTENING)
-    latitude, longitude = np.radians(places[:, :2]).T
-    across = EQUATOR / np.sqrt(1 - squared * np.sin(latitude) ** 2)
-    globe = np.column_stack(
+    squared_eccentricity = FLATTENING * (2 - FLATTENING)
+    latitude, longitude = np.radians(coordinates[:, :2]).T
+    normal_radius = EQUATORIAL_RADIUS / np.sqrt(1 - squared_eccentricity * np.sin(latitude) ** 2)
+    geocentric = np.column_stack(
         (
-            across * np.cos(latitude) * np.cos(longitude),
-            across * np.cos(latitude) * np.sin(longitude),
-            across * (1 - squared) * np.sin(latitude),
+            normal_radius * np.cos(latitude) * np.cos(longitude),
+            normal_radius * np.cos(latitude) * np.sin(longitude),
+            normal_radius * (1 - squared_eccentricity) * np.sin(latitude),
         )
     )
     sin, cos, east, ahead = np.sin(latitude[0]), np.cos(latitude[0]), np.sin(longitude[0]), np.cos(longitude[0])
     plane = np.array([[-east, ahead, 0.0], [-sin * ahead, -sin * east, cos]])
-    flat: FloatArray = (globe - globe[0]) @ plane.T
-    return flat
+    projected: FloatArray = (geocentric - geocentric[0]) @ plane.T
+    return projected

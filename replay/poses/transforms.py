@@ -1,4 +1,4 @@
-"""The tf tree of a log: transforms between frames over time, and how a chain of them looks from above."""
+"""The tf tree of a log: transforms between frames over time, chains of them, and their projection to the plane."""
 
 from __future__ import annotations
 
@@ -11,33 +11,37 @@ import numpy as np
 from numpy.typing import NDArray
 
 from prim.arrays import FloatArray, Stamps
-from prim.log.mcap import LogReader
 from prim.log.messages import MAP_FRAME, ODOM_FRAME, TF_TYPE, StampedPose, decode_poses
-from replay.poses.sensors import is_usable
+from prim.log.source import LogSource
+from replay.poses.sensors import is_valid_pose
 
-ROOTS = (MAP_FRAME, ODOM_FRAME)
-"""Frames that stand still, the best first."""
+FIXED_FRAMES = (MAP_FRAME, ODOM_FRAME)
+"""Frames that do not move (REP 105), in order of preference."""
 
-STATIC = "tf_static"
-"""Topics whose names end so hold transforms that stay."""
-
-MAX_TILT = 0.97
-"""Below this cosine a laser's plane counts as tilted, and its scans as no horizontal section (14 degrees)."""
+STATIC_SUFFIX = "tf_static"
+"""Topics whose names end so hold static transforms."""
 
 
 @dataclass(frozen=True)
-class Transforms:
-    """3D transforms over time: ``stamps`` (N,), ``translations`` (N, 3), ``rotations`` (N, 4) as x, y, z, w."""
+class TransformSeries:
+    """A frame's 3D pose in its parent over time.
+
+    Attributes:
+        stamps: (N,) ns, strictly rising.
+        translations: (N, 3) m.
+        rotations: Unit quaternions (N, 4) as x, y, z, w.
+        static: Whether the transform holds at all times.
+    """
 
     stamps: Stamps
     translations: FloatArray
     rotations: FloatArray
     static: bool
 
-    def at(self, stamps: Stamps) -> tuple[FloatArray, FloatArray, NDArray[np.bool_]]:
-        """Rotation matrices (M, 3, 3), translations (M, 3), and which stamps lie within the transforms' time.
+    def interpolate(self, stamps: Stamps) -> tuple[FloatArray, FloatArray, NDArray[np.bool_]]:
+        """Interpolate translations linearly and rotations along the shortest arc (slerp) at ``stamps`` (M,) in ns.
 
-        In between, translations are interpolated linearly and rotations along the shortest arc.
+        Returns rotation matrices (M, 3, 3), translations (M, 3) in m, and which stamps (M,) lie within the series.
         """
         after = np.clip(np.searchsorted(self.stamps, stamps), 0, len(self.stamps) - 1)
         before = np.maximum(after - 1, 0)
@@ -46,77 +50,112 @@ class Transforms:
         translations = (1 - share) * self.translations[before] + share * self.translations[after]
         rotations = _slerp(self.rotations[before], self.rotations[after], share)
         within = (stamps >= self.stamps[0]) & (stamps <= self.stamps[-1]) | self.static
-        return _matrices(rotations), translations, within
+        return _rotation_matrices(rotations), translations, within
 
 
 @dataclass
 class TransformTree:
-    """The tf tree of a log: each frame's parent and where the frame stands in it over time."""
+    """The tf tree of a log.
 
-    edges: dict[str, tuple[str, Transforms]] = field(default_factory=dict)
-    disputed: list[tuple[str, str]] = field(default_factory=list)
+    Attributes:
+        edges: By each frame its parent, and its pose there over time.
+        conflicts: Frames that have several parents, each with the parent that is used.
+    """
+
+    edges: dict[str, tuple[str, TransformSeries]] = field(default_factory=dict)
+    conflicts: list[tuple[str, str]] = field(default_factory=list)
 
     @classmethod
-    def read(cls, log: LogReader, static_only: bool = False) -> TransformTree:
-        """Reads all topics of tf messages, or those of static ones alone. Raises LogReadError."""
+    def read(cls, log: LogSource, static_only: bool = False) -> TransformTree:
+        """Read the transforms of a log.
+
+        Args:
+            log: The log.
+            static_only: Read the topics of static transforms alone.
+
+        Returns:
+            The tree; an empty one where the log has no transforms.
+
+        Raises:
+            LogReadError: A message is missing, damaged, or cannot be decoded.
+        """
         found: dict[tuple[str, str], list[StampedPose]] = defaultdict(list)
         static: set[tuple[str, str]] = set()
         for topic in log.of_type(TF_TYPE):
-            if static_only and not topic.name.endswith(STATIC):
+            if static_only and not topic.name.endswith(STATIC_SUFFIX):
                 continue
             for _, poses in log.decoded(topic, partial(decode_poses, TF_TYPE)):
                 for pose in poses:
                     edge = pose.frame_id.lstrip("/"), pose.child_frame_id.lstrip("/")
                     found[edge].append(pose)
-                    if topic.name.endswith(STATIC):
+                    if topic.name.endswith(STATIC_SUFFIX):
                         static.add(edge)
         tree = cls()
-        usable = {edge: kept for edge, poses in found.items() if (kept := [p for p in poses if is_usable(p)])}
+        usable = {edge: valid for edge, poses in found.items() if (valid := [p for p in poses if is_valid_pose(p)])}
         parents = Counter(child for _, child in usable)
         # of several parents the last one stays: map or odom, else the one with the most transforms
-        for edge, poses in sorted(usable.items(), key=lambda item: (item[0][0] in ROOTS, len(item[1]))):
-            tree.edges[edge[1]] = edge[0], _transforms(poses, edge in static or len(poses) == 1)
-        tree.disputed = [(child, tree.edges[child][0]) for child, count in parents.items() if count > 1]
+        for edge, poses in sorted(usable.items(), key=lambda item: (item[0][0] in FIXED_FRAMES, len(item[1]))):
+            tree.edges[edge[1]] = edge[0], _series(poses, edge in static or len(poses) == 1)
+        tree.conflicts = [(child, tree.edges[child][0]) for child, count in parents.items() if count > 1]
         return tree
 
     def chain(self, frame: str) -> list[str]:
-        """The frames from ``frame`` up to its root, both included."""
+        """Return the frames from ``frame`` up to its root, both included."""
         chain = [frame.lstrip("/")]
         while chain[-1] in self.edges and self.edges[chain[-1]][0] not in chain:
             chain.append(self.edges[chain[-1]][0])
         return chain
 
     def lookup(self, chain: Sequence[str], stamps: Stamps) -> tuple[FloatArray, FloatArray, NDArray[np.bool_]]:
-        """Rotations, translations and validity of the chain's first frame in its last, at ``stamps``."""
+        """Compute the pose of a chain's first frame in its last.
+
+        Args:
+            chain: Frames, each followed by its parent.
+            stamps: (N,) ns.
+
+        Returns:
+            Rotation matrices (N, 3, 3), translations (N, 3) in m, and at which stamps (N,) all transforms are known.
+        """
         rotation = np.broadcast_to(np.eye(3), (len(stamps), 3, 3))
         translation = np.zeros((len(stamps), 3))
         valid = np.ones(len(stamps), dtype=bool)
         for frame in chain[:-1]:
-            turn, shift, within = self.edges[frame][1].at(stamps)
+            turn, shift, within = self.edges[frame][1].interpolate(stamps)
             rotation = turn @ rotation
             translation = np.einsum("nij,nj->ni", turn, translation) + shift
             valid &= within
         return rotation, translation, valid
 
 
-def flatten(rotation: FloatArray, translation: FloatArray) -> tuple[FloatArray, bool, tuple[str, ...]]:
-    """3D poses seen from above: x, y, heading of the x axis (N, 3); upside down or not; notes."""
+def project_to_plane(
+    rotation: FloatArray, translation: FloatArray, min_upright: float
+) -> tuple[FloatArray, bool, tuple[str, ...]]:
+    """Project 3D poses of a laser to the horizontal plane.
+
+    Args:
+        rotation: Rotation matrices (N, 3, 3).
+        translation: Translations (N, 3) in m.
+        min_upright: A laser whose axis has a smaller cosine to the vertical is reported as tilted.
+
+    Returns:
+        Poses (N, 3) as x, y (m) and heading of the x axis (rad), whether the laser is upside down, and notes.
+    """
     heading = np.arctan2(rotation[:, 1, 0], rotation[:, 0, 0])
     up = np.median(rotation[:, 2, 2])
     notes: tuple[str, ...] = ()
-    if abs(up) < MAX_TILT:
+    if abs(up) < min_upright:
         tilt = np.degrees(np.arccos(min(abs(up), 1.0)))
         notes = (f"the laser is tilted by {tilt:.0f} degrees: the map shows its plane, not the floor plan",)
     return np.column_stack((translation[:, :2], heading)), bool(up < 0), notes
 
 
-def _transforms(poses: Sequence[StampedPose], static: bool) -> Transforms:
-    """Transforms sorted by stamp; of several with one stamp the last; of static ones the last alone."""
+def _series(poses: Sequence[StampedPose], static: bool) -> TransformSeries:
+    """Sort transforms by stamp; of several with one stamp the last remains, of static ones the last alone."""
     if static:
         poses = poses[-1:]
     by_stamp = {pose.stamp: pose for pose in sorted(poses, key=lambda pose: pose.stamp)}
     rotations = np.array([pose.rotation for pose in by_stamp.values()])
-    return Transforms(
+    return TransformSeries(
         np.array(list(by_stamp), dtype=np.int64),
         np.array([pose.translation for pose in by_stamp.values()]),
         rotations / np.linalg.norm(rotations, axis=1, keepdims=True),
@@ -125,7 +164,7 @@ def _transforms(poses: Sequence[StampedPose], static: bool) -> Transforms:
 
 
 def _slerp(a: FloatArray, b: FloatArray, share: FloatArray) -> FloatArray:
-    """Unit quaternions (N, 4) at ``share`` (N, 1) of the shorter arc from a to b."""
+    """Return unit quaternions (N, 4) at ``share`` (N, 1) of the shorter arc from a to b (Shoemake, 1985)."""
     cosine = np.einsum("ni,ni->n", a, b)[:, None]
     b = np.where(cosine < 0, -b, b)
     angle = np.arccos(np.clip(np.abs(cosine), 0.0, 1.0))
@@ -137,8 +176,8 @@ def _slerp(a: FloatArray, b: FloatArray, share: FloatArray) -> FloatArray:
     return first * a + second * b
 
 
-def _matrices(quaternions: FloatArray) -> FloatArray:
-    """Rotation matrices (N, 3, 3) of unit quaternions (N, 4) as x, y, z, w."""
+def _rotation_matrices(quaternions: FloatArray) -> FloatArray:
+    """Return the rotation matrices (N, 3, 3) of unit quaternions (N, 4) as x, y, z, w."""
     x, y, z, w = quaternions.T
     rows = (
         (1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),

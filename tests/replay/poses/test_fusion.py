@@ -1,4 +1,4 @@
-"""The filter and smoother of poses: against filterpy, against the whole posterior at once, and on made-up drives."""
+"""Kalman filter and smoother of poses: against filterpy, against the joint posterior, and on simulated drives."""
 
 import math
 from dataclasses import dataclass, replace
@@ -6,23 +6,22 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pytest
 from filterpy.kalman import ExtendedKalmanFilter
-from hypothesis import given
-from hypothesis import strategies as st
-from hypothesis.extra import numpy as hnp
 
 from prim.arrays import FloatArray, Stamps
 from prim.metrics import pose_nees, pose_rmse
-from prim.se2 import Pose2D, Trajectory, wrap_angles
-from replay.poses.fusion import Estimate, Fusion, Nodes, PoseNoise, nodes_at, steps_between, walk, way_of
-from replay.poses.kalman import GATES, REJECTED
+from prim.se2 import Trajectory, integrate_steps, wrap_angles
+from replay.poses.fusion import Fusion, PoseEstimate
+from replay.poses.fusion_nodes import FusionNodes, travelled_distances
+from replay.poses.fusion_options import FusionOptions, NoiseEstimationOptions, SensorNoise
+from replay.poses.kalman import REJECTED
 
 SECOND = 10**9
-TRUE_NOISE = PoseNoise(0.1, math.radians(3), 0.05, math.radians(2), 0.0)
+TRUE_NOISE = SensorNoise(0.1, math.radians(3), 0.05, math.radians(2), 0.0)
 
 
 @dataclass(frozen=True)
 class Drive:
-    """A made-up drive with the recorder's kind of noise."""
+    """A simulated drive with the recorder's model of noise."""
 
     stamps: Stamps
     truth: FloatArray
@@ -30,15 +29,15 @@ class Drive:
     fixes: FloatArray
     headings: FloatArray
 
-    def nodes(self, odometry: bool = True, gps: bool = True, compass: bool = True) -> Nodes:
-        return nodes_at(
+    def nodes(self, odometry: bool = True, gps: bool = True, compass: bool = True) -> FusionNodes:
+        return FusionNodes.from_readings(
             self.stamps,
             self.odometry if odometry else None,
             (self.stamps, self.fixes) if gps else None,
             (self.stamps, self.headings) if compass else None,
         )
 
-    def errors(self, estimate: Estimate) -> tuple[float, float]:
+    def errors(self, estimate: PoseEstimate) -> tuple[float, float]:
         return pose_rmse(estimate.poses, self.truth)
 
 
@@ -47,31 +46,31 @@ def drive(seed: int, count: int = 600) -> Drive:
     turns = np.repeat(rng.normal(0, 0.05, count // 20), 20)
     steps = np.column_stack((np.full(count, 0.02), np.zeros(count), turns))
     steps[0] = 0
-    truth = walk(steps, np.array([0.5, -0.3, 1.0]))
-    way = np.hypot(steps[:, 0], steps[:, 1])[:, None] + 0.03 * np.abs(steps[:, 2:])
-    noise = rng.standard_normal((count, 3)) * (0.05, 0.05, math.radians(2)) * np.sqrt(way)
-    believed = walk(steps + noise)
+    truth = integrate_steps(steps, np.array([0.5, -0.3, 1.0]))
+    distances = np.hypot(steps[:, 0], steps[:, 1])[:, None] + 0.03 * np.abs(steps[:, 2:])
+    noise = rng.standard_normal((count, 3)) * (0.05, 0.05, math.radians(2)) * np.sqrt(distances)
+    odometry = integrate_steps(steps + noise)
     stamps = np.arange(count) * (SECOND // 10) + SECOND
     fixes = truth[:, :2] + rng.normal(0, 0.1, (count, 2))
     headings = wrap_angles(truth[:, 2] + rng.normal(0, math.radians(3), count))
     truth[:, 2] = wrap_angles(truth[:, 2])
-    return Drive(stamps, truth, Trajectory(stamps, believed), fixes, headings)
+    return Drive(stamps, truth, Trajectory(stamps, odometry), fixes, headings)
 
 
-def test_the_filter_does_what_filterpys_does() -> None:
-    one = drive(1, 60)
-    fusion = Fusion(one.nodes(), TRUE_NOISE)
-    found = fusion.filtered()
+def test_filter_agrees_with_filterpy() -> None:
+    driven = drive(1, 60)
+    fusion = Fusion(driven.nodes(), TRUE_NOISE)
+    filtered = fusion.filtered()
     other = ExtendedKalmanFilter(3, 2)
-    state, spread = fusion.start
-    other.x, other.P = state, np.diag(spread[[0, 3, 5]])
+    initial = fusion.initial_state
+    other.x, other.P = initial.pose, np.diag(initial.covariance[[0, 3, 5]])
     nodes = fusion.nodes
     for k in range(len(nodes.stamps)):
-        step, way = nodes.steps[k], nodes.ways[k]
+        step, distance = nodes.steps[k], nodes.distances[k]
         cos, sin = math.cos(other.x[2]), math.sin(other.x[2])
         moved = np.array([cos * step[0] - sin * step[1], sin * step[0] + cos * step[1], step[2]])
         other.F = np.array([[1, 0, -moved[1]], [0, 1, moved[0]], [0, 0, 1]])
-        other.Q = np.diag([0.05**2 * way, 0.05**2 * way, math.radians(2) ** 2 * way]) + 1e-10 * np.eye(3)
+        other.Q = np.diag([0.05**2, 0.05**2, math.radians(2) ** 2]) * distance + 1e-10 * np.eye(3)
         other.x = other.x + moved
         other.P = other.F @ other.P @ other.F.T + other.Q
         other.update(nodes.fixes[k], lambda _: np.eye(2, 3), lambda x: x[:2], 0.01 * np.eye(2))
@@ -79,21 +78,23 @@ def test_the_filter_does_what_filterpys_does() -> None:
         other.update(
             np.array([near]), lambda _: np.array([[0.0, 0, 1]]), lambda x: x[2:], np.array([[math.radians(3) ** 2]])
         )
-        assert found.poses[k] == pytest.approx(np.append(other.x[:2], wrap_angles(other.x[2])), abs=1e-9)
-        assert found.covariances[k] == pytest.approx(other.P, abs=1e-12)
+        assert filtered.poses[k] == pytest.approx(np.append(other.x[:2], wrap_angles(other.x[2])), abs=1e-9)
+        assert filtered.covariances[k] == pytest.approx(other.P, abs=1e-12)
 
 
-def test_the_smoother_and_its_frame_are_those_of_the_whole_posterior() -> None:
-    """With a robot that does not move the problem is linear: all nodes at once, by one inverse."""
+def test_smoother_and_frame_covariance_agree_with_the_joint_posterior() -> None:
+    """The problem is linear where the robot does not move: the joint posterior of all nodes is one inverse."""
     rng = np.random.default_rng(2)
     count, place, turn = 12, 0.02, 0.03
     stamps = np.arange(count) * SECOND
     still = Trajectory(stamps, np.tile([0.4, 0.2, 0.1], (count, 1)))
     fixes, headings = 0.3 + rng.normal(0, 0.1, (count, 2)), 0.1 + rng.normal(0, 0.05, count)
-    nodes = replace(nodes_at(stamps, still, (stamps, fixes), (stamps, headings)), ways=np.ones(count))
-    fusion = Fusion(nodes, PoseNoise(0.1, 0.05, place, turn, 0.0))
+    nodes = replace(
+        FusionNodes.from_readings(stamps, still, (stamps, fixes), (stamps, headings)), distances=np.ones(count)
+    )
+    fusion = Fusion(nodes, SensorNoise(0.1, 0.05, place, turn, 0.0))
     found = fusion.smoothed()
-    start, spread = fusion.start
+    initial = fusion.initial_state
     variances = np.array([place, place, turn]) ** 2 + 1e-10
     information, vector = np.zeros((3 * count, 3 * count)), np.zeros(3 * count)
     sensors = np.array([0.1, 0.1, 0.05]) ** -2.0
@@ -106,9 +107,10 @@ def test_the_smoother_and_its_frame_are_those_of_the_whole_posterior() -> None:
             information[at - 3, at - 3] += 1 / variances
             information[at, at - 3] -= 1 / variances
             information[at - 3, at] -= 1 / variances
-    first = 1 / (spread[[0, 3, 5]] + 1e-10 + variances - 1e-10)  # the filter moves before the first node as well
+    # the filter makes a step before the first node as well
+    first = 1 / (initial.covariance[[0, 3, 5]] + 1e-10 + variances - 1e-10)
     information[:3, :3] += np.diag(first)
-    vector[:3] += first * start
+    vector[:3] += first * initial.pose
     covariance = np.linalg.inv(information)
     assert found.poses.ravel() == pytest.approx(covariance @ vector, abs=1e-8)
     for k in range(count):
@@ -119,30 +121,30 @@ def test_the_smoother_and_its_frame_are_those_of_the_whole_posterior() -> None:
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_smoothed_poses_beat_the_filters_and_the_odometrys_and_say_how_sure_they_are(seed: int) -> None:
-    one = drive(seed)
-    fusion = Fusion(one.nodes())
+def test_smoothed_poses_are_more_accurate_than_filtered_ones_and_consistent(seed: int) -> None:
+    driven = drive(seed)
+    fusion = Fusion(driven.nodes())
     smoothed = fusion.smoothed()
-    metres, radians = one.errors(smoothed)
-    forward_metres, forward_radians = one.errors(fusion.filtered())
+    metres, radians = driven.errors(smoothed)
+    forward_metres, forward_radians = driven.errors(fusion.filtered())
     assert metres < 0.032 and radians < math.radians(0.8)
     assert metres < 0.9 * forward_metres and radians < 0.9 * forward_radians
-    assert 1.5 < pose_nees(smoothed.poses, one.truth, smoothed.covariances) < 5
+    assert 1.5 < pose_nees(smoothed.poses, driven.truth, smoothed.covariances) < 5
 
 
-def test_the_noise_is_found_from_the_log() -> None:
+def test_noise_is_estimated_from_the_log() -> None:
     found = [Fusion(drive(seed).nodes()).noise for seed in range(4)]
-    assert np.mean([one.fixes for one in found]) == pytest.approx(0.1, rel=0.05)
-    assert np.mean([one.headings for one in found]) == pytest.approx(math.radians(3), rel=0.05)
-    assert np.mean([one.metres for one in found]) == pytest.approx(0.05, rel=0.25)
-    assert np.mean([one.radians for one in found]) == pytest.approx(math.radians(2), rel=0.25)
-    assert all(one.bias == 0 for one in found)
+    assert np.mean([noise.position_std for noise in found]) == pytest.approx(0.1, rel=0.05)
+    assert np.mean([noise.heading_std for noise in found]) == pytest.approx(math.radians(3), rel=0.05)
+    assert np.mean([noise.odometry_translation_std for noise in found]) == pytest.approx(0.05, rel=0.25)
+    assert np.mean([noise.odometry_rotation_std for noise in found]) == pytest.approx(math.radians(2), rel=0.25)
+    assert all(noise.heading_bias == 0 for noise in found)
 
 
-def test_noise_that_is_given_stays() -> None:
-    noise = Fusion(drive(0).nodes(), PoseNoise(fixes=0.3, metres=0.2)).noise
-    assert (noise.fixes, noise.metres) == (0.3, 0.2)
-    assert noise.headings == pytest.approx(math.radians(3), rel=0.2)
+def test_given_noise_is_not_changed() -> None:
+    noise = Fusion(drive(0).nodes(), SensorNoise(position_std=0.3, odometry_translation_std=0.2)).noise
+    assert (noise.position_std, noise.odometry_translation_std) == (0.3, 0.2)
+    assert noise.heading_std == pytest.approx(math.radians(3), rel=0.2)
 
 
 @pytest.mark.parametrize(
@@ -154,126 +156,121 @@ def test_noise_that_is_given_stays() -> None:
         ({"odometry": True, "gps": False, "compass": False}, 12.0, 180.0),
     ],
 )
-def test_any_subset_of_the_sensors_will_do(sensors: dict[str, bool], metres: float, degrees: float) -> None:
-    one = drive(3)
-    nodes = one.nodes(**sensors)
-    if not sensors["gps"]:  # the odometry's own start is all that is known of the place
-        one = replace(one, truth=one.truth - np.append(one.truth[0, :2], 0.0))
+def test_any_sufficient_subset_of_the_sensors_gives_poses(
+    sensors: dict[str, bool], metres: float, degrees: float
+) -> None:
+    driven = drive(3)
+    nodes = driven.nodes(**sensors)
+    if not sensors["gps"]:  # the position is known relative to the odometry's start only
+        driven = replace(driven, truth=driven.truth - np.append(driven.truth[0, :2], 0.0))
     found = Fusion(nodes).smoothed()
     assert np.isfinite(found.poses).all() and np.isfinite(found.covariances).all()
-    error = one.errors(found)
+    error = driven.errors(found)
     assert error[0] < metres and error[1] < math.radians(degrees)
 
 
 def test_no_sensor_at_all_is_an_error() -> None:
     with pytest.raises(ValueError, match="no sensor"):
-        nodes_at(np.arange(3), None, None, None)
+        FusionNodes.from_readings(np.arange(3), None, None, None)
     with pytest.raises(ValueError, match="within the time"):
-        nodes_at(np.arange(3), Trajectory(np.array([10, 11]), np.zeros((2, 3))), None, None)
+        FusionNodes.from_readings(np.arange(3), Trajectory(np.array([10, 11]), np.zeros((2, 3))), None, None)
 
 
-def test_wild_fixes_and_headings_are_left_out() -> None:
-    one = drive(4)
+def test_outliers_among_fixes_and_headings_are_rejected() -> None:
+    driven = drive(4)
     rng = np.random.default_rng(0)
-    wild = rng.random(len(one.stamps)) < 0.05
-    fixes, headings = one.fixes.copy(), one.headings.copy()
-    fixes[wild] += rng.normal(0, 5, (wild.sum(), 2))
-    headings[wild] += 2.0
-    clean, soiled = Fusion(one.nodes()), Fusion(replace(one, fixes=fixes, headings=headings).nodes())
-    found = soiled.smoothed()
-    assert one.errors(found)[0] < 1.3 * one.errors(clean.smoothed())[0]
-    assert (found.verdicts[wild, 1] == REJECTED).all()
-    assert found.used(0)[1] >= 0.8 * wild.sum() and found.used(1)[1] < 1.3 * wild.sum()
+    outlier = rng.random(len(driven.stamps)) < 0.05
+    fixes, headings = driven.fixes.copy(), driven.headings.copy()
+    fixes[outlier] += rng.normal(0, 5, (outlier.sum(), 2))
+    headings[outlier] += 2.0
+    clean, disturbed = Fusion(driven.nodes()), Fusion(replace(driven, fixes=fixes, headings=headings).nodes())
+    found = disturbed.smoothed()
+    assert driven.errors(found)[0] < 1.3 * driven.errors(clean.smoothed())[0]
+    assert (found.decisions[outlier, 1] == REJECTED).all()
+    assert found.reading_counts(0)[1] >= 0.8 * outlier.sum() and found.reading_counts(1)[1] < 1.3 * outlier.sum()
 
 
-def test_a_robot_that_is_carried_away_is_found_again() -> None:
-    one = drive(5)
-    truth, fixes = one.truth.copy(), one.fixes.copy()
+def test_filter_recovers_after_the_robot_was_carried_away() -> None:
+    driven = drive(5)
+    truth, fixes = driven.truth.copy(), driven.fixes.copy()
     truth[300:, 0] += 5
     fixes[300:, 0] += 5
-    fusion = Fusion(replace(one, fixes=fixes).nodes(), TRUE_NOISE)
+    fusion = Fusion(replace(driven, fixes=fixes).nodes(), TRUE_NOISE)
     assert np.abs(fusion.filtered().poses[380:, :2] - truth[380:, :2]).max() < 0.4
     smoothed = fusion.smoothed().poses[:, :2]
-    assert np.abs(smoothed - truth[:, :2])[np.r_[:299, 321:600]].max() < 0.25  # the jump itself stays a jump
+    assert np.abs(smoothed - truth[:, :2])[np.r_[:299, 321:600]].max() < 0.25  # the smoother does not spread the jump
 
 
-def test_a_robot_whose_wheels_stand_still_is_not_believed_for_ever() -> None:
-    one = drive(11)
-    frozen = Trajectory(one.stamps, np.tile(one.odometry.poses[:1], (len(one.stamps), 1)))
-    found = Fusion(replace(one, odometry=frozen).nodes()).smoothed()
-    metres, _ = one.errors(found)
-    assert metres < 0.5 and found.used(0)[1] < 0.5 * len(one.stamps)
+def test_filter_recovers_from_odometry_that_stands_still() -> None:
+    driven = drive(11)
+    frozen = Trajectory(driven.stamps, np.tile(driven.odometry.poses[:1], (len(driven.stamps), 1)))
+    found = Fusion(replace(driven, odometry=frozen).nodes()).smoothed()
+    metres, _ = driven.errors(found)
+    assert metres < 0.5 and found.reading_counts(0)[1] < 0.5 * len(driven.stamps)
     assert np.sqrt(found.covariances[:, 0, 0]).mean() > 0.02
 
 
-def test_the_noise_is_found_from_readings_between_the_scans(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("replay.poses.fusion.MOST_NODES", 200)
-    one = drive(10)
-    between = one.stamps + SECOND // 20
-    nodes = nodes_at(between, one.odometry, (one.stamps, one.fixes), (one.stamps, one.headings))
-    assert Fusion(nodes).noise.fixes == pytest.approx(0.1, rel=0.15)
-
-
-def test_a_biased_compass_is_found_out() -> None:
-    one = drive(6)
-    fusion = Fusion(replace(one, headings=wrap_angles(one.headings + 0.2)).nodes())
-    assert fusion.noise.bias == pytest.approx(0.2, abs=0.08)
-    assert one.errors(fusion.smoothed())[1] < math.radians(4)
-
-
-def test_the_antenna_may_stand_off_the_robots_centre() -> None:
-    one = drive(7)
-    at = np.array([0.3, -0.1])
-    cos, sin = np.cos(one.truth[:, 2]), np.sin(one.truth[:, 2])
-    fixes = one.fixes + np.column_stack((cos * at[0] - sin * at[1], sin * at[0] + cos * at[1]))
-    nodes = nodes_at(
-        one.stamps, one.odometry, (one.stamps, fixes), (one.stamps, one.headings), (float(at[0]), float(at[1]))
+def test_noise_is_estimated_from_a_subset_of_readings_between_the_scans() -> None:
+    options = FusionOptions(estimation=NoiseEstimationOptions(max_nodes=200))
+    driven = drive(10)
+    between = driven.stamps + SECOND // 20
+    nodes = FusionNodes.from_readings(
+        between, driven.odometry, (driven.stamps, driven.fixes), (driven.stamps, driven.headings)
     )
-    assert one.errors(Fusion(nodes).smoothed())[0] < 0.032
+    assert Fusion(nodes, None, options).noise.position_std == pytest.approx(0.1, rel=0.15)
 
 
-def test_readings_at_times_of_their_own_count_where_they_were_taken() -> None:
-    one = drive(8)
-    later = one.stamps[:-1] + SECOND // 25
-    truth, _ = Trajectory(one.stamps, one.truth).at(later)
-    fixes = truth[:, :2] + one.fixes[:-1] - one.truth[:-1, :2]
-    nodes = nodes_at(one.stamps[::3], one.odometry, (later, fixes), (one.stamps, one.headings))
+def test_compass_bias_is_estimated() -> None:
+    driven = drive(6)
+    fusion = Fusion(replace(driven, headings=wrap_angles(driven.headings + 0.2)).nodes())
+    assert fusion.noise.heading_bias == pytest.approx(0.2, abs=0.08)
+    assert driven.errors(fusion.smoothed())[1] < math.radians(4)
+
+
+def test_lever_arm_of_the_antenna_is_accounted_for() -> None:
+    driven = drive(7)
+    at = np.array([0.3, -0.1])
+    cos, sin = np.cos(driven.truth[:, 2]), np.sin(driven.truth[:, 2])
+    fixes = driven.fixes + np.column_stack((cos * at[0] - sin * at[1], sin * at[0] + cos * at[1]))
+    nodes = FusionNodes.from_readings(
+        driven.stamps,
+        driven.odometry,
+        (driven.stamps, fixes),
+        (driven.stamps, driven.headings),
+        (float(at[0]), float(at[1])),
+    )
+    assert driven.errors(Fusion(nodes).smoothed())[0] < 0.032
+
+
+def test_readings_between_the_scans_are_used_at_their_own_stamps() -> None:
+    driven = drive(8)
+    later = driven.stamps[:-1] + SECOND // 25
+    truth, _ = Trajectory(driven.stamps, driven.truth).at(later)
+    fixes = truth[:, :2] + driven.fixes[:-1] - driven.truth[:-1, :2]
+    nodes = FusionNodes.from_readings(
+        driven.stamps[::3], driven.odometry, (later, fixes), (driven.stamps, driven.headings)
+    )
     found = Fusion(nodes).smoothed()
-    at = np.searchsorted(found.stamps, one.stamps[::3])
-    assert pose_rmse(found.poses[at], one.truth[::3])[0] < 0.034
-
-
-@given(hnp.arrays(float, (7, 3), elements=st.floats(-2, 2)))
-def test_steps_lead_where_they_came_from(poses: FloatArray) -> None:
-    assert walk(steps_between(poses), poses[0])[:, :2] == pytest.approx(poses[:, :2], abs=1e-9)
-    assert np.cos(walk(steps_between(poses), poses[0])[:, 2] - poses[:, 2]) == pytest.approx(1)
+    at = np.searchsorted(found.stamps, driven.stamps[::3])
+    assert pose_rmse(found.poses[at], driven.truth[::3])[0] < 0.034
 
 
 @pytest.mark.parametrize("stride", [2, 7])
-def test_fewer_nodes_are_the_same_drive(stride: int) -> None:
+def test_subset_of_nodes_has_the_same_trajectory(stride: int) -> None:
     nodes = drive(9).nodes()
-    thin = nodes.only(np.arange(0, len(nodes.stamps), stride))
-    assert walk(thin.steps)[-1] == pytest.approx(walk(nodes.steps)[::stride][-1], abs=1e-9)
-    assert thin.ways.sum() == pytest.approx(nodes.ways[: stride * (len(thin.ways) - 1) + 1].sum())
+    thin = nodes.subset(np.arange(0, len(nodes.stamps), stride))
+    assert integrate_steps(thin.steps)[-1] == pytest.approx(integrate_steps(nodes.steps)[::stride][-1], abs=1e-9)
+    assert thin.distances.sum() == pytest.approx(nodes.distances[: stride * (len(thin.distances) - 1) + 1].sum())
 
 
-def test_way_counts_turns() -> None:
+def test_travelled_distance_includes_turns() -> None:
     turned = Trajectory(np.arange(3), np.array([[0, 0, 0], [0.3, 0.4, 0], [0.3, 0.4, 1.0]]))
-    assert way_of(turned) == pytest.approx([0, 0.5, 0.53])
+    assert travelled_distances(turned, 0.03) == pytest.approx([0, 0.5, 0.53])
 
 
-def test_gates_let_999_of_1000_through() -> None:
-    rng = np.random.default_rng(0)
-    assert np.mean((rng.standard_normal((100_000, 2)) ** 2).sum(axis=1) > GATES[0]) == pytest.approx(0.001, abs=4e-4)
-    assert np.mean(rng.standard_normal(100_000) ** 2 > GATES[1]) == pytest.approx(0.001, abs=4e-4)
-
-
-def test_poses_carry_on_when_pushed_through_a_mount() -> None:
-    from replay.poses.localize import carried, compose
-
-    covariance = np.diag([0.01, 0.02, 0.03])
-    robot, mount = Pose2D(1, 2, 0.7, covariance), Pose2D(0.2, -0.1, 0.4)
-    laser = robot @ mount
-    poses, mounts = np.array([[1, 2, 0.7]]), np.array([[0.2, -0.1, 0.4]])
-    assert compose(poses, mounts)[0] == pytest.approx([laser.x, laser.y, laser.theta])
-    assert carried(covariance[None], poses, mounts)[0] == pytest.approx(laser.covariance)
+def test_gates_reject_one_in_a_thousand() -> None:
+    rng, options = np.random.default_rng(0), FusionOptions()
+    assert np.mean((rng.standard_normal((100_000, 2)) ** 2).sum(axis=1) > options.fix_gate) == pytest.approx(
+        0.001, abs=4e-4
+    )
+    assert np.mean(rng.standard_normal(100_000) ** 2 > options.heading_gate) == pytest.approx(0.001, abs=4e-4)

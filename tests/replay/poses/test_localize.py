@@ -1,4 +1,4 @@
-"""Poses from tf trees, odometry and the truth, in logs that the tests write."""
+"""Poses from tf trees, odometry and ground truth, in logs that the tests write."""
 
 import math
 from collections.abc import Callable
@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from prim.errors import LogReadError
-from prim.log.mcap import LogReader
+from prim.log import open_log
 from prim.log.messages import (
     ODOMETRY_TYPE,
     POSE_TYPE,
@@ -21,11 +21,12 @@ from prim.log.messages import (
     encode_scan,
     encode_transforms,
 )
+from prim.log.source import LogSource
 from prim.log.writer import LogWriter
 from prim.scan import Scan
 from prim.se2 import Pose2D
+from replay.poses.laser_poses import ScanTimes
 from replay.poses.localize import Localizer
-from replay.poses.scan_times import ScanTimes
 from replay.poses.transforms import TransformTree
 
 SECOND = 10**9
@@ -35,7 +36,7 @@ TIMES = ScanTimes(STAMPS, "laser")
 Write = Callable[[LogWriter], None]
 
 
-def log_of(path: Path, *writers: Write) -> LogReader:
+def log_of(path: Path, *writers: Write) -> LogSource:
     with LogWriter(path) as log:
         log.add_topic("/scan", SCAN_TYPE)
         for stamp in STAMPS.tolist():
@@ -43,7 +44,7 @@ def log_of(path: Path, *writers: Write) -> LogReader:
             log.write("/scan", stamp, encode_scan(scan))
         for write in writers:
             write(log)
-    return LogReader(path)
+    return open_log(path)
 
 
 def odometry(topic: str, *poses: tuple[float, Pose2D]) -> Write:
@@ -87,33 +88,33 @@ def pose_tuple(pose: Pose2D) -> tuple[float, float, float]:
 
 
 @pytest.mark.parametrize("source", ["auto", "tf"])
-def test_a_tf_chain_is_composed_and_interpolated(tmp_path: Path, source: str) -> None:
+def test_tf_chain_is_composed_and_interpolated(tmp_path: Path, source: str) -> None:
     with log_of(tmp_path / "a.mcap", MOUNT, transforms("/tf", *MOVING)) as log:
-        found = Localizer(log).locate(TIMES, source)
-    assert (found.source, found.origin) == ("tf", "odom > base_link > laser")
-    assert found.valid.all()
-    assert found.poses[1] == pytest.approx(pose_tuple(HALFWAY))
+        located = Localizer(log).locate(TIMES, source)
+    assert (located.source, located.origin) == ("tf", "odom > base_link > laser")
+    assert located.valid.all()
+    assert located.poses[1] == pytest.approx(pose_tuple(HALFWAY))
 
 
-def test_a_chain_that_reaches_map_goes_there(tmp_path: Path) -> None:
+def test_tf_chain_is_followed_to_map(tmp_path: Path) -> None:
     to_map = (0, "map", "odom", Pose2D(5, 0, 0))
     with log_of(tmp_path / "a.mcap", transforms("/tf_static", to_map), MOUNT_2, transforms("/tf", *MOVING)) as log:
-        found = Localizer(log).locate(TIMES)
-    assert found.origin == "map > odom > base_link > laser"
-    assert found.poses[1, 0] == pytest.approx(HALFWAY.x + 5)
+        located = Localizer(log).locate(TIMES)
+    assert located.origin == "map > odom > base_link > laser"
+    assert located.poses[1, 0] == pytest.approx(HALFWAY.x + 5)
 
 
 MOUNT_2 = transforms("/other/tf_static", (0, "base_link", "laser", Pose2D(0.1, 0.2, math.pi / 2)))
 
 
-def test_odometry_stands_on_the_robot_and_the_laser_on_its_mount(tmp_path: Path) -> None:
+def test_odometry_is_composed_with_the_mount_of_the_laser(tmp_path: Path) -> None:
     with log_of(tmp_path / "a.mcap", MOUNT, DRIVE) as log:
-        found = Localizer(log).locate(TIMES, "odom")
-        assert found.poses[1] == pytest.approx(pose_tuple(HALFWAY))
-        assert found.notes == ()
+        located = Localizer(log).locate(TIMES, "odom")
+        assert located.poses[1] == pytest.approx(pose_tuple(HALFWAY))
+        assert located.notes == ()
 
 
-def test_an_unknown_mount_is_said_and_can_be_given(tmp_path: Path) -> None:
+def test_unknown_mount_is_reported_and_can_be_given(tmp_path: Path) -> None:
     with log_of(tmp_path / "a.mcap", DRIVE) as log:
         assert "no transform from base_link to laser" in Localizer(log).locate(TIMES).notes[0]
         given = Localizer(log, laser_offset=Pose2D(0.1, 0.2, math.pi / 2)).locate(TIMES)
@@ -121,7 +122,7 @@ def test_an_unknown_mount_is_said_and_can_be_given(tmp_path: Path) -> None:
     assert given.poses[1] == pytest.approx(pose_tuple(HALFWAY))
 
 
-def test_truth_goes_first(tmp_path: Path) -> None:
+def test_auto_prefers_the_ground_truth(tmp_path: Path) -> None:
     true = truth((1, Pose2D(7, 0, 0)), (2, Pose2D(7, 0, 0)))
     with log_of(tmp_path / "a.mcap", MOUNT, DRIVE, transforms("/tf", *MOVING), true) as log:
         localizer = Localizer(log)
@@ -130,19 +131,19 @@ def test_truth_goes_first(tmp_path: Path) -> None:
     assert sources == {"auto": "truth", "truth": "truth", "tf": "tf", "odom": "odom"}
 
 
-def test_pose_stamped_serves_where_there_is_no_odometry(tmp_path: Path) -> None:
+def test_pose_stamped_is_used_where_there_is_no_odometry(tmp_path: Path) -> None:
     def write(log: LogWriter) -> None:
         log.add_topic("/pose", POSE_TYPE)
         for second in (1, 2):
             log.write("/pose", second * SECOND, encode_pose(second * SECOND, Pose2D(second, 0, 0)))
 
     with log_of(tmp_path / "a.mcap", MOUNT, write) as log:
-        found = Localizer(log).locate(TIMES)
-    assert (found.source, found.origin) == ("odom", "/pose")
-    assert found.poses[1, 0] == pytest.approx(1.6)
+        located = Localizer(log).locate(TIMES)
+    assert (located.source, located.origin) == ("odom", "/pose")
+    assert located.poses[1, 0] == pytest.approx(1.6)
 
 
-def test_two_odometries_are_named(tmp_path: Path) -> None:
+def test_several_topics_of_odometry_are_listed(tmp_path: Path) -> None:
     other = odometry("/wheels", (1, Pose2D(9, 0, 0)), (2, Pose2D(9, 0, 0)))
     with log_of(tmp_path / "a.mcap", DRIVE, other) as log:
         with pytest.raises(LogReadError, match=r"/odom, /wheels; choose one with --odom-topic"):
@@ -152,12 +153,12 @@ def test_two_odometries_are_named(tmp_path: Path) -> None:
             Localizer(log, odom_topic="/none").locate(TIMES)
 
 
-def test_scans_outside_the_poses_are_marked(tmp_path: Path) -> None:
+def test_scans_outside_the_time_of_the_poses_are_invalid(tmp_path: Path) -> None:
     with log_of(tmp_path / "a.mcap", MOUNT, odometry("/odom", (1.4, Pose2D()), (3, Pose2D()))) as log:
         assert Localizer(log).locate(TIMES).valid.tolist() == [False, True, True]
 
 
-def test_two_clocks_are_refused(tmp_path: Path) -> None:
+def test_poses_on_another_clock_are_an_error(tmp_path: Path) -> None:
     with (
         log_of(tmp_path / "a.mcap", odometry("/odom", (1000, Pose2D()), (1001, Pose2D()))) as log,
         pytest.raises(LogReadError, match="two clocks"),
@@ -166,7 +167,7 @@ def test_two_clocks_are_refused(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("source", "said"),
+    ("source", "message"),
     [
         ("auto", "--standing-still"),
         ("truth", "no ground truth"),
@@ -174,8 +175,8 @@ def test_two_clocks_are_refused(tmp_path: Path) -> None:
         ("odom", "no poses"),
     ],
 )
-def test_no_poses_at_all(tmp_path: Path, source: str, said: str) -> None:
-    with log_of(tmp_path / "a.mcap", MOUNT) as log, pytest.raises(LogReadError, match=said):
+def test_missing_poses_are_an_error(tmp_path: Path, source: str, message: str) -> None:
+    with log_of(tmp_path / "a.mcap", MOUNT) as log, pytest.raises(LogReadError, match=message):
         Localizer(log).locate(TIMES, source)
 
 
@@ -199,28 +200,28 @@ def raw_transform(parent: str, child: str, rotation: tuple[float, float, float, 
     return write
 
 
-def test_a_laser_that_hangs_upside_down_is_found(tmp_path: Path) -> None:
+def test_laser_mounted_upside_down_is_detected(tmp_path: Path) -> None:
     rolled = raw_transform("base_link", "laser", (1.0, 0.0, 0.0, 0.0))
     with log_of(tmp_path / "a.mcap", rolled, transforms("/tf", *MOVING), DRIVE) as log:
         for source in ("tf", "odom"):
-            found = Localizer(log).locate(TIMES, source)
-            assert found.upside_down
-            assert found.poses[1] == pytest.approx((1, 0, math.pi / 4))
+            located = Localizer(log).locate(TIMES, source)
+            assert located.upside_down
+            assert located.poses[1] == pytest.approx((1, 0, math.pi / 4))
 
 
-def test_a_tilted_laser_is_said(tmp_path: Path) -> None:
+def test_tilted_laser_is_reported(tmp_path: Path) -> None:
     half = math.radians(30) / 2
     pitched = raw_transform("base_link", "laser", (0.0, math.sin(half), 0.0, math.cos(half)))
     with log_of(tmp_path / "a.mcap", pitched, DRIVE) as log:
         assert "tilted by 30 degrees" in Localizer(log).locate(TIMES).notes[0]
 
 
-def test_a_rotation_of_zeros_is_no_transform(tmp_path: Path) -> None:
+def test_transform_with_a_rotation_of_zeros_is_left_out(tmp_path: Path) -> None:
     with log_of(tmp_path / "a.mcap", raw_transform("base_link", "laser", (0.0, 0.0, 0.0, 0.0))) as log:
         assert TransformTree.read(log).edges == {}
 
 
-def test_a_loop_in_tf_ends(tmp_path: Path) -> None:
+def test_loop_in_tf_ends(tmp_path: Path) -> None:
     loop = transforms("/tf", (1, "a", "laser", Pose2D()), (2, "laser", "a", Pose2D()))
     with log_of(tmp_path / "a.mcap", loop) as log:
         assert TransformTree.read(log).chain("laser") == ["laser", "a"]

@@ -1,4 +1,4 @@
-"""Scans matched with the map: the likelihood's slope, poses that come back, deskewed scans."""
+"""Scan matching: the score of the likelihood, convergence to the true poses, deskewed scans."""
 
 import math
 from collections.abc import Iterator
@@ -10,22 +10,23 @@ import numpy as np
 import pytest
 
 from mapping.forward.mapper import ForwardMapper
-from mapping.forward.scan_likelihood import Beams, Likelihood, climb
+from mapping.forward.scan_likelihood import ScanLikelihood, ScanRays, maximize_pose
 from prim.arrays import FloatArray
-from prim.log.mcap import LogReader
+from prim.log import open_log
 from prim.metrics import pose_rmse
-from prim.scan import PosedScan, Scan, pieces_of
+from prim.scan import PosedScan, Scan, deskew
 from prim.se2 import Pose2D, wrap_angles
 from prim.shapes import Kind, Primitive
 from prim.world import World
 from recorder.sensors import Lidar
-from recorder.session import SessionOptions, record
+from recorder.session import SessionOptions, record_session
 from replay.options import ReplayOptions
 from replay.pipeline import Pipeline
-from replay.posed_scans import ScanLog
-from replay.poses.fusion import PoseNoise
-from replay.poses.localize import FUSED, LaserPoses, Localizer
-from replay.poses.scan_matching import match
+from replay.posed_scans import PosedScans, ScanLog
+from replay.poses.fusion_options import SensorNoise
+from replay.poses.laser_poses import FUSED, LaserPoses
+from replay.poses.localize import Localizer
+from replay.poses.scan_matching import match_scans
 from replay.selection import Selection
 
 ROOM = World(
@@ -49,86 +50,88 @@ def around(count: int) -> list[Pose2D]:
 
 
 @pytest.fixture(scope="module")
-def likelihood() -> Likelihood:
+def likelihood() -> ScanLikelihood:
     mapper = ForwardMapper(0.01, (-1.1, -1.1, 1.1, 1.1))
     poses = around(30)
     for scan, pose in zip(scans_of(poses), poses, strict=True):
-        mapper.keep(scan, pose)
+        mapper.accumulate(scan, pose)
     fit = mapper.fit()
-    return Likelihood.of(fit, fit.noise)
+    return ScanLikelihood.of(fit, fit.noise)
 
 
 @pytest.mark.parametrize("mount", [Pose2D(), Pose2D(0.1, -0.05, 0.8)])
-def test_a_scan_leads_back_to_where_it_was_taken(likelihood: Likelihood, mount: Pose2D) -> None:
+def test_matching_recovers_the_true_pose(likelihood: ScanLikelihood, mount: Pose2D) -> None:
     laser = Pose2D(0.1, -0.4, 0.5)
     scan = scans_of([laser])[0]
     robot = laser @ mount.inverse()
     true = np.array([robot.x, robot.y, robot.theta])
     at = np.array([mount.x, mount.y, mount.theta])
-    beams = Beams.of([(scan, laser)], laser, 200)
+    beams = ScanRays.from_pieces([(scan, laser)], laser, 200)
     start = true + np.array([0.02, -0.015, 0.02])
-    nearer, _ = climb(likelihood, beams, at, start, start, np.zeros((3, 3)), widened=2.0)
-    pose, look = climb(likelihood, beams, at, nearer, nearer, np.zeros((3, 3)))
-    std = np.sqrt(np.diag(np.linalg.inv(look.information)))
+    nearer, _ = maximize_pose(likelihood, beams, at, start, start, np.zeros((3, 3)), noise_scale=2.0)
+    pose, score = maximize_pose(likelihood, beams, at, nearer, nearer, np.zeros((3, 3)))
+    std = np.sqrt(np.diag(np.linalg.inv(score.information)))
     assert np.abs(pose - true) == pytest.approx(0, abs=5 * std.max())
     assert std[:2].max() < 0.006 and std[2] < 0.01
-    assert likelihood.of_scan(beams, pose, at) > likelihood.of_scan(beams, true + np.array([0.05, 0, 0]), at)
+    assert likelihood.log_likelihood(beams, pose, at) > likelihood.log_likelihood(
+        beams, true + np.array([0.05, 0, 0]), at
+    )
 
 
-def test_the_slope_is_the_likelihoods(likelihood: Likelihood) -> None:
+def test_score_is_the_gradient_of_the_log_likelihood(likelihood: ScanLikelihood) -> None:
     laser = Pose2D(0.05, -0.45, 1.0)
-    beams = Beams.of([(scans_of([laser])[0], laser)], laser, 200)
+    beams = ScanRays.from_pieces([(scans_of([laser])[0], laser)], laser, 200)
     pose = np.array([0.06, -0.46, 1.01])
-    look = likelihood.look(beams, pose, NO_MOUNT)
+    evaluated = likelihood.score(beams, pose, NO_MOUNT)
     step = max(0.5 * 0.01, 0.2 * likelihood.noise.std)
     for axis in range(3):
         nudge = step * np.eye(3)[axis]
-        up, down = (likelihood.of_scan(beams, pose + sign * nudge, NO_MOUNT) for sign in (1, -1))
-        assert look.slope[axis] == pytest.approx((up - down) / (2 * step), rel=1e-6, abs=1e-6)
-    assert look.log_likelihood == pytest.approx(likelihood.of_scan(beams, pose, NO_MOUNT))
-    assert np.linalg.eigvalsh(look.information).min() > 0
+        up, down = (likelihood.log_likelihood(beams, pose + sign * nudge, NO_MOUNT) for sign in (1, -1))
+        assert evaluated.score[axis] == pytest.approx((up - down) / (2 * step), rel=1e-6, abs=1e-6)
+    assert evaluated.log_likelihood == pytest.approx(likelihood.log_likelihood(beams, pose, NO_MOUNT))
+    assert np.linalg.eigvalsh(evaluated.information).min() > 0
 
 
-def test_beams_are_spread_and_keep_what_is_cut_off(make_scan) -> None:  # type: ignore[no-untyped-def]
+def test_selected_rays_are_spread_evenly_and_include_censored_ones(make_scan) -> None:  # type: ignore[no-untyped-def]
     scan = make_scan(1.0, math.nan, math.inf, -math.inf, 0.001, 2.0)
-    beams = Beams.of([(scan, Pose2D(1, 1, 1))], Pose2D(1, 1, 1), 100)
+    beams = ScanRays.from_pieces([(scan, Pose2D(1, 1, 1))], Pose2D(1, 1, 1), 100)
     assert beams.rays[:, 4].tolist() == [1.0, math.inf, -math.inf, 2.0]
-    assert len(Beams.of([(scan, Pose2D())], Pose2D(), 2).rays) == 2
-    first, second = (Beams.of([(scan, Pose2D())], Pose2D(), 2, offset).rays[:, 4] for offset in (0, 1))
+    assert len(ScanRays.from_pieces([(scan, Pose2D())], Pose2D(), 2).rays) == 2
+    first, second = (ScanRays.from_pieces([(scan, Pose2D())], Pose2D(), 2, offset).rays[:, 4] for offset in (0, 1))
     assert first.tolist() == [1.0, -math.inf] and second.tolist() == [math.inf, 2.0]
 
 
 @pytest.fixture(scope="module")
 def driven(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("driven") / "driven.mcap"
-    record(
+    record_session(
         path, SessionOptions(seed=3, motion="drive", duration=25.0, rate=5.0, lidar=Lidar(rays=200, noise_std=0.03))
     )
     return path
 
 
 @pytest.mark.parametrize(("source", "share"), [("odom", 1 / 3), (FUSED, 0.8)])
-def test_matched_poses_are_nearer_the_truth(driven: Path, source: str, share: float) -> None:
-    with LogReader(driven) as log:
+def test_matched_poses_are_more_accurate(driven: Path, source: str, share: float) -> None:
+    with open_log(driven) as log:
         scans = ScanLog(log, None, Selection())
         truth = Localizer(log).locate(scans.times, "truth").poses
         poses = Localizer(log).locate(scans.times, source)
-        matched = match(poses, scans.stamps, partial(Pipeline(driven, ReplayOptions())._posed, scans), 0.02)
+        matched = match_scans(poses, scans.stamps, partial(PosedScans, scans), 0.02)
     before, after = pose_rmse(poses.poses, truth), pose_rmse(matched.poses, truth)
     assert after[0] < share * before[0] and after[1] < before[1]
     assert after[0] < 0.03
     assert matched.matched and matched.covariances is not None and matched.source == source
 
 
-def test_poses_that_do_not_drift_come_back_from_noise(driven: Path) -> None:
-    with LogReader(driven) as log:
+def test_matching_reduces_the_noise_of_poses_that_do_not_drift(driven: Path) -> None:
+    with open_log(driven) as log:
         scans = ScanLog(log, None, Selection())
         truth = Localizer(log).locate(scans.times, "truth")
         rng = np.random.default_rng(1)
         noise = np.column_stack((rng.normal(0, 0.1, (len(truth.poses), 2)), rng.normal(0, 0.03, len(truth.poses))))
         noisy = replace(truth, poses=truth.poses + noise)
-        posed = partial(Pipeline(driven, ReplayOptions())._posed, scans)
-        matched = match(noisy, scans.stamps, posed, 0.02, None, PoseNoise(0.1, 0.03))
+        source = partial(PosedScans, scans)
+        matched = match_scans(noisy, scans.stamps, source, 0.02, None, SensorNoise(0.1, 0.03))
     assert pose_rmse(matched.poses, truth.poses)[0] < 0.3 * pose_rmse(noisy.poses, truth.poses)[0]
 
 
@@ -148,32 +151,32 @@ def sweeping(start: Pose2D, end: Pose2D, rays: int = 180) -> Scan:
     return Scan(1, "laser", -lidar.fov / 2, step, 0.03, 5.0, np.array(ranges, np.float32), 0.1 / rays, 0.1)
 
 
-def off_the_walls(points: FloatArray) -> float:
-    """How far points are from the room's walls and primitives, at worst of nine in ten (m)."""
+def distance_to_surfaces(points: FloatArray) -> float:
+    """The 90th percentile of points' distances to the room's walls and primitives (m)."""
     walls = np.min(np.abs(1 - np.abs(points)), axis=1)
     outlines = np.concatenate([primitive.outline(400) for primitive in ROOM.primitives])
     shapes = np.min(np.hypot(*(points[:, None] - outlines[None]).transpose(2, 0, 1)), axis=1)
     return float(np.percentile(np.minimum(walls, shapes), 90))
 
 
-def test_a_sweeping_scan_is_put_right() -> None:
+def test_deskewing_places_points_on_surfaces() -> None:
     start, end = Pose2D(-0.1, -0.5, 0.2), Pose2D(0.0, -0.45, 0.5)
     scan = sweeping(start, end)
-    pieces = pieces_of(scan, start, end, 0.005)
+    pieces = deskew(scan, start, end, 0.005)
     assert 1 < len(pieces) <= 64
     assert np.concatenate([piece.ranges for piece, _ in pieces]).tolist() == scan.ranges.tolist()
     assert np.concatenate([piece.directions for piece, _ in pieces]) == pytest.approx(scan.directions)
     assert [piece.stamp for piece, _ in pieces] == sorted(piece.stamp for piece, _ in pieces)
-    put_right = PosedScan(0, scan, start, pieces).points
-    assert off_the_walls(put_right) < 0.006
-    assert off_the_walls(scan.points(start)) > 0.03
+    deskewed = PosedScan(0, scan, start, pieces).points
+    assert distance_to_surfaces(deskewed) < 0.006
+    assert distance_to_surfaces(scan.points(start)) > 0.03
 
 
 @pytest.mark.parametrize("end", [None, Pose2D(0.1, 0.2, 0.3)])
-def test_a_laser_that_stands_still_keeps_its_scan(end: Pose2D | None, make_scan) -> None:  # type: ignore[no-untyped-def]
+def test_scan_of_a_laser_at_rest_is_not_cut(end: Pose2D | None, make_scan) -> None:  # type: ignore[no-untyped-def]
     scan = make_scan(1.0, 2.0, 3.0)
     pose = Pose2D(0.1, 0.2, 0.3)
-    assert pieces_of(scan, pose, end, 0.01) == [(scan, pose)]
+    assert deskew(scan, pose, end, 0.01) == [(scan, pose)]
 
 
 def write_sweeps(path: Path) -> None:
@@ -196,41 +199,41 @@ def write_sweeps(path: Path) -> None:
 
 
 @pytest.mark.parametrize("mapper", ["det", "prob", "forward"])
-def test_a_replay_deskews_and_can_be_told_not_to(tmp_path: Path, mapper: str) -> None:
+def test_replay_deskews_scans_unless_disabled(tmp_path: Path, mapper: str) -> None:
     path = tmp_path / "sweeps.mcap"
     write_sweeps(path)
     options = ReplayOptions(mapper=mapper, laser_offset=Pose2D(), detect=False)
     counts = []
-    for deskew in (True, False):
-        result = Pipeline(path, replace(options, deskew=deskew)).run()
+    for is_deskewed in (True, False):
+        result = Pipeline(path, replace(options, deskew=is_deskewed)).run()
         assert result.scans_used == 13
         counts.append(np.count_nonzero(result.grid.probability > 0.65))
         rows, cols = np.nonzero(result.grid.probability > 0.65)
         x0, y0 = result.grid.frame.origin
         points = np.column_stack((x0 + (cols + 0.5) * 0.01, y0 + (rows + 0.5) * 0.01))
-        assert (off_the_walls(points) < 0.02) == deskew
+        assert (distance_to_surfaces(points) < 0.02) == is_deskewed
     assert counts[0] < counts[1]
 
 
-def test_ends_follow_corrected_poses(driven: Path) -> None:
-    with LogReader(driven) as log:
+def test_end_poses_follow_corrected_poses(driven: Path) -> None:
+    with open_log(driven) as log:
         scans = ScanLog(log, None, Selection(n_scans=20))
         times = replace(scans.times, sweep=10**8)
         poses = Localizer(log).locate(times, "odom")
-        assert poses.ends is not None
+        assert poses.end_poses is not None
 
         def posed(of: LaserPoses) -> Iterator[PosedScan]:
             for position, scan in scans:
                 yield PosedScan(position, scan, of.at(position), [(scan, of.at(position))])
 
-        matched = match(poses, scans.stamps, posed, 0.02)
-        assert matched.ends is not None
-        before, after = poses.ends - poses.poses, matched.ends - matched.poses
+        matched = match_scans(poses, scans.stamps, posed, 0.02)
+        assert matched.end_poses is not None
+        before, after = poses.end_poses - poses.poses, matched.end_poses - matched.poses
         assert np.hypot(*after[:, :2].T) == pytest.approx(np.hypot(*before[:, :2].T), abs=1e-9)
         assert wrap_angles(after[:, 2] - before[:, 2]) == pytest.approx(0, abs=1e-9)
 
 
-def test_a_sweep_that_cannot_be_is_not_believed(tmp_path: Path) -> None:
+def test_implausible_sweep_is_not_deskewed_and_is_reported(tmp_path: Path) -> None:
     from prim.log.messages import SCAN_TYPE, encode_scan
     from prim.log.writer import LogWriter
 

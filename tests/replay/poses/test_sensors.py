@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from prim.errors import LogReadError
-from prim.log.mcap import LogReader
+from prim.log import open_log
 from prim.log.messages import (
     FIX_TYPE,
     POINT_TYPE,
@@ -21,8 +21,10 @@ from prim.log.messages import (
     encode_pose,
 )
 from prim.se2 import Pose2D, wrap_angles
-from replay.poses.localize import FUSED, FuseOptions, Localizer
-from replay.poses.sensors import find_compass, find_gps, flattened, headings, read_compass, read_gps
+from replay.poses.fusion_options import FusionInputs
+from replay.poses.laser_poses import FUSED
+from replay.poses.localize import Localizer
+from replay.poses.sensors import compass_headings, find_compass, find_gps, geodetic_to_plane, read_compass, read_gps
 from tests.replay.poses.test_localize import (
     DRIVE,
     SECOND,
@@ -35,10 +37,10 @@ from tests.replay.poses.test_localize import (
     truth,
 )
 
-WAY = [(1.0, 0.0), (1.5, 1.0), (2.0, 2.0)]
+DRIVE_X = [(1.0, 0.0), (1.5, 1.0), (2.0, 2.0)]
 """Seconds and x of a robot that drives along x."""
 
-STRAIGHT = odometry("/odom", *((t, Pose2D(x, 0, 0)) for t, x in WAY))
+STRAIGHT = odometry("/odom", *((t, Pose2D(x, 0, 0)) for t, x in DRIVE_X))
 
 
 def points(topic: str, *fixes: tuple[float, float, float], frame: str = "map") -> Write:
@@ -58,10 +60,10 @@ def goal(topic: str, x: float) -> Write:
     return write
 
 
-def norths(topic: str, *turns: tuple[float, float]) -> Write:
+def north_vectors(topic: str, *angles: tuple[float, float]) -> Write:
     def write(log) -> None:  # type: ignore[no-untyped-def]
         log.add_topic(topic, VECTOR_TYPE)
-        for seconds, heading in turns:
+        for seconds, heading in angles:
             log.write(topic, round(seconds * SECOND), encode_compass(round(seconds * SECOND), heading))
 
     return write
@@ -87,26 +89,26 @@ def satellites(topic: str, *fixes: tuple[float, float, float], status: int = 0) 
     return write
 
 
-GPS = points("/gps", *((t, x + 5, 7) for t, x in WAY))
-COMPASS = norths("/compass", *((t, 0.0) for t, _ in WAY))
+GPS = points("/gps", *((t, x + 5, 7) for t, x in DRIVE_X))
+COMPASS = north_vectors("/compass", *((t, 0.0) for t, _ in DRIVE_X))
 
 
-def test_fused_poses_lie_where_gps_and_compass_say(tmp_path: Path) -> None:
+def test_fused_poses_agree_with_gps_and_compass(tmp_path: Path) -> None:
     with log_of(tmp_path / "a.mcap", STRAIGHT, GPS, COMPASS) as log:
-        found = Localizer(log).locate(TIMES, FUSED)
-        assert found.source == FUSED and found.origin == "/odom, /gps, /compass"
-        assert found.poses[:, 0] == pytest.approx([5, 6, 7], abs=0.05)
-        assert found.poses[:, 1] == pytest.approx([7, 7, 7], abs=0.05)
-        assert found.valid.all() and found.covariances is not None
+        located = Localizer(log).locate(TIMES, FUSED)
+        assert located.source == FUSED and located.origin == "/odom, /gps, /compass"
+        assert located.poses[:, 0] == pytest.approx([5, 6, 7], abs=0.05)
+        assert located.poses[:, 1] == pytest.approx([7, 7, 7], abs=0.05)
+        assert located.valid.all() and located.covariances is not None
 
 
-def test_order_duplicates_and_gaps_do_not_matter(tmp_path: Path) -> None:
+def test_fused_poses_do_not_depend_on_order_and_duplicates(tmp_path: Path) -> None:
     with log_of(tmp_path / "a.mcap", STRAIGHT, GPS, COMPASS) as log:
-        tidy = Localizer(log).locate(TIMES, FUSED)
-    shuffled = points("/gps", *((t, x + 5, 7) for t, x in (WAY[2], WAY[0], WAY[1], WAY[1])))
-    twice = odometry("/odom", *((t, Pose2D(x, 0, 0)) for t, x in (*WAY[::-1], WAY[0])))
+        expected = Localizer(log).locate(TIMES, FUSED)
+    shuffled = points("/gps", *((t, x + 5, 7) for t, x in (DRIVE_X[2], DRIVE_X[0], DRIVE_X[1], DRIVE_X[1])))
+    twice = odometry("/odom", *((t, Pose2D(x, 0, 0)) for t, x in (*DRIVE_X[::-1], DRIVE_X[0])))
     with log_of(tmp_path / "b.mcap", twice, shuffled, COMPASS) as log:
-        assert Localizer(log).locate(TIMES, FUSED).poses == pytest.approx(tidy.poses)
+        assert Localizer(log).locate(TIMES, FUSED).poses == pytest.approx(expected.poses)
 
 
 @pytest.mark.parametrize(
@@ -118,32 +120,32 @@ def test_order_duplicates_and_gaps_do_not_matter(tmp_path: Path) -> None:
         ((STRAIGHT, GPS, COMPASS), "/odom, /gps, /compass"),
     ],
 )
-def test_auto_fuses_what_there_is(tmp_path: Path, writers: tuple[Write, ...], origin: str) -> None:
+def test_auto_fuses_the_available_sensors(tmp_path: Path, writers: tuple[Write, ...], origin: str) -> None:
     with log_of(tmp_path / "a.mcap", *writers) as log:
-        found = Localizer(log).locate(TIMES)
-        assert (found.source, found.origin) == (FUSED, origin)
+        located = Localizer(log).locate(TIMES)
+        assert (located.source, located.origin) == (FUSED, origin)
 
 
-def test_auto_prefers_the_truth_and_a_tf_chain_to_map(tmp_path: Path) -> None:
-    localized = transforms("/tf", *((t, "map", "laser", Pose2D(x, 0, 0)) for t, x in WAY))
+def test_auto_prefers_the_ground_truth_and_a_tf_chain_to_map(tmp_path: Path) -> None:
+    localized = transforms("/tf", *((t, "map", "laser", Pose2D(x, 0, 0)) for t, x in DRIVE_X))
     with log_of(tmp_path / "a.mcap", STRAIGHT, GPS, localized) as log:
         assert Localizer(log).locate(TIMES).source == "tf"
-    with log_of(tmp_path / "b.mcap", STRAIGHT, GPS, truth(*((t, Pose2D(x, 0, 0)) for t, x in WAY))) as log:
+    with log_of(tmp_path / "b.mcap", STRAIGHT, GPS, truth(*((t, Pose2D(x, 0, 0)) for t, x in DRIVE_X))) as log:
         assert Localizer(log).locate(TIMES).source == "truth"
 
 
-def test_auto_takes_no_clicked_point_for_a_gps(tmp_path: Path) -> None:
+def test_clicked_point_is_not_taken_for_a_gps(tmp_path: Path) -> None:
     with log_of(tmp_path / "a.mcap", STRAIGHT, points("/prefix/clicked_point", (1.0, 3, 3))) as log:
         assert Localizer(log).locate(TIMES).source == "odom"
 
 
-def test_a_topic_of_another_name_is_taken_when_asked_for(tmp_path: Path) -> None:
-    with log_of(tmp_path / "a.mcap", STRAIGHT, points("/beacon", *((t, x, 7) for t, x in WAY)), COMPASS) as log:
-        found = Localizer(log, fuse=FuseOptions(gps_topic="/beacon")).locate(TIMES, FUSED)
-        assert found.origin == "/odom, /beacon, /compass"
+def test_gps_topic_of_any_name_can_be_requested(tmp_path: Path) -> None:
+    with log_of(tmp_path / "a.mcap", STRAIGHT, points("/beacon", *((t, x, 7) for t, x in DRIVE_X)), COMPASS) as log:
+        located = Localizer(log, inputs=FusionInputs(gps_topic="/beacon")).locate(TIMES, FUSED)
+        assert located.origin == "/odom, /beacon, /compass"
 
 
-def test_several_gps_are_named(tmp_path: Path) -> None:
+def test_several_gps_topics_are_listed(tmp_path: Path) -> None:
     with log_of(tmp_path / "a.mcap", GPS, points("/gps_rear", (1.0, 0, 0))) as log:
         with pytest.raises(LogReadError, match=r"2 topics to choose from: .*choose one with --gps-topic"):
             find_gps(log)
@@ -151,28 +153,28 @@ def test_several_gps_are_named(tmp_path: Path) -> None:
             find_gps(log, "/nothing")
 
 
-def test_without_sensors_the_error_says_what_there_is(tmp_path: Path) -> None:
+def test_error_without_enough_sensors_lists_the_available_ones(tmp_path: Path) -> None:
     with log_of(tmp_path / "a.mcap", GPS) as log, pytest.raises(LogReadError, match=r"need odometry.*there is /gps"):
         Localizer(log).locate(TIMES, FUSED)
 
 
-def test_odometry_alone_is_said_to_be_alone(tmp_path: Path) -> None:
+def test_fusion_of_odometry_alone_is_reported(tmp_path: Path) -> None:
     with log_of(tmp_path / "a.mcap", DRIVE) as log:
-        found = Localizer(log).locate(TIMES, FUSED)
-        assert "no GPS and no compass: fused poses are those of /odom" in found.notes
-        assert found.poses == pytest.approx(Localizer(log).locate(TIMES, "odom").poses, abs=1e-6)
+        located = Localizer(log).locate(TIMES, FUSED)
+        assert "no GPS and no compass: fused poses are those of /odom" in located.notes
+        assert located.poses == pytest.approx(Localizer(log).locate(TIMES, "odom").poses, abs=1e-6)
 
 
-def test_two_clocks_are_an_error(tmp_path: Path) -> None:
+def test_sensors_on_another_clock_are_an_error(tmp_path: Path) -> None:
     late = [odometry("/odom", (900.0, Pose2D()), (901.0, Pose2D()))]
     error = pytest.raises(LogReadError, match=r"no scan .* lies within the time of .*two clocks")
     with log_of(tmp_path / "a.mcap", *late, points("/gps", (900.5, 0, 0))) as log, error:
         Localizer(log).locate(TIMES, FUSED)
 
 
-def test_values_that_are_no_numbers_are_skipped_and_said(tmp_path: Path) -> None:
+def test_values_that_are_not_finite_are_skipped_and_reported(tmp_path: Path) -> None:
     broken = points("/gps", (1.0, 0, 0), (1.5, math.nan, 0), (2.0, math.inf, 0))
-    with log_of(tmp_path / "a.mcap", broken, norths("/compass", (1.0, math.nan))) as log:
+    with log_of(tmp_path / "a.mcap", broken, north_vectors("/compass", (1.0, math.nan))) as log:
         topic, other = find_gps(log), find_compass(log)
         assert topic is not None and other is not None
         gps = read_gps(log, topic)
@@ -181,37 +183,37 @@ def test_values_that_are_no_numbers_are_skipped_and_said(tmp_path: Path) -> None
         assert len(read_compass(log, other).stamps) == 0
 
 
-def test_north_is_the_maps_y(tmp_path: Path) -> None:
-    turns = [0.0, 1.0, -3.0]
-    with log_of(tmp_path / "a.mcap", norths("/compass", *zip((1.0, 1.5, 2.0), turns, strict=True))) as log:
+def test_north_is_the_y_axis_of_the_map(tmp_path: Path) -> None:
+    angles = [0.0, 1.0, -3.0]
+    with log_of(tmp_path / "a.mcap", north_vectors("/compass", *zip((1.0, 1.5, 2.0), angles, strict=True))) as log:
         topic = find_compass(log)
         assert topic is not None
-        read = read_compass(log, topic)
-        assert headings(read, np.eye(3)) == pytest.approx(turns)
+        readings = read_compass(log, topic)
+        assert compass_headings(readings, np.eye(3)) == pytest.approx(angles)
         quarter = np.array([[0, -1, 0], [1, 0, 0], [0, 0, 1]])
-        expected = wrap_angles(np.array(turns) - math.pi / 2)
-        assert wrap_angles(headings(read, quarter)) == pytest.approx(expected)
+        expected = wrap_angles(np.array(angles) - math.pi / 2)
+        assert wrap_angles(compass_headings(readings, quarter)) == pytest.approx(expected)
 
 
-def test_a_compass_may_hang_upside_down(tmp_path: Path) -> None:
-    turns = [0.3, 0.8, 1.2]
-    hung = raw_transform("base_link", "compass", (1.0, 0.0, 0.0, 0.0))
+def test_compass_may_be_mounted_upside_down(tmp_path: Path) -> None:
+    angles = [0.3, 0.8, 1.2]
+    mount = raw_transform("base_link", "compass", (1.0, 0.0, 0.0, 0.0))
 
     def mirrored(log) -> None:  # type: ignore[no-untyped-def]
         log.add_topic("/compass", VECTOR_TYPE)
-        for (seconds, _), turn in zip(WAY, turns, strict=True):
+        for (seconds, _), turn in zip(DRIVE_X, angles, strict=True):
             stamp = round(seconds * SECOND)
             north = _new("geometry_msgs/msg/Vector3", x=math.sin(turn), y=-math.cos(turn), z=0.0)
             log.write(
                 "/compass", stamp, _serialize(_new(VECTOR_TYPE, header=_header(stamp, "compass"), vector=north))
             )
 
-    spin = odometry("/odom", *((t, Pose2D(0, 0, turn)) for (t, _), turn in zip(WAY, turns, strict=True)))
-    with log_of(tmp_path / "a.mcap", hung, mirrored, spin) as log:
-        assert Localizer(log).locate(TIMES, FUSED).poses[:, 2] == pytest.approx(turns, abs=0.01)
+    spin = odometry("/odom", *((t, Pose2D(0, 0, turn)) for (t, _), turn in zip(DRIVE_X, angles, strict=True)))
+    with log_of(tmp_path / "a.mcap", mount, mirrored, spin) as log:
+        assert Localizer(log).locate(TIMES, FUSED).poses[:, 2] == pytest.approx(angles, abs=0.01)
 
 
-def test_satellite_fixes_become_metres_east_and_north(tmp_path: Path) -> None:
+def test_satellite_fixes_are_projected_to_east_and_north(tmp_path: Path) -> None:
     north = 52.0 + 10 / 111_267.0  # a degree of latitude is 111,267 m long there
     with log_of(tmp_path / "a.mcap", satellites("/fix", (1.0, 52.0, 13.0), (2.0, north, 13.0))) as log:
         topic = find_gps(log)
@@ -226,44 +228,44 @@ def test_satellite_messages_without_a_fix_are_skipped(tmp_path: Path) -> None:
         assert topic is not None and len(read_gps(log, topic).stamps) == 0
 
 
-def test_auto_falls_back_to_tf_and_says_why(tmp_path: Path) -> None:
-    moving = transforms("/tf", *((t, "odom", "laser", Pose2D(x, 0, 0)) for t, x in WAY))
+def test_auto_falls_back_to_tf_and_reports_why(tmp_path: Path) -> None:
+    moving = transforms("/tf", *((t, "odom", "laser", Pose2D(x, 0, 0)) for t, x in DRIVE_X))
     indoors = satellites("/fix", (1.0, 52.0, 13.0), status=-1)
     with log_of(tmp_path / "a.mcap", moving, indoors, COMPASS) as log:
-        found = Localizer(log).locate(TIMES)
-        assert found.source == "tf" and any(note.startswith("nothing is fused: ") for note in found.notes)
+        located = Localizer(log).locate(TIMES)
+        assert located.source == "tf" and any(note.startswith("nothing is fused: ") for note in located.notes)
     with log_of(tmp_path / "b.mcap", moving, GPS, goal("/goal_pose", 3.0)) as log:
         assert Localizer(log).locate(TIMES).source == "tf"
 
 
-def test_what_a_gps_lost_is_said_though_nothing_is_left_of_it(tmp_path: Path) -> None:
+def test_skipped_messages_are_reported_where_no_reading_remains(tmp_path: Path) -> None:
     with log_of(tmp_path / "a.mcap", STRAIGHT, points("/gps", (1.0, math.nan, 0)), COMPASS) as log:
-        found = Localizer(log).locate(TIMES, FUSED)
-        assert "/gps: 1 messages without a usable value were skipped" in found.notes
-        assert [sensor.name for sensor in found.sensors] == ["odom", "compass"]
-        assert "m" not in found.sensors[0].std  # nothing told how far off the odometry's place is
+        located = Localizer(log).locate(TIMES, FUSED)
+        assert "/gps: 1 messages without a usable value were skipped" in located.notes
+        assert [sensor.name for sensor in located.sensors] == ["odom", "compass"]
+        assert "m" not in located.sensors[0].std  # the noise of the odometry's position cannot be estimated
 
 
-def test_flattening_keeps_distances() -> None:
+def test_projection_to_the_plane_preserves_distances() -> None:
     """A degree of longitude at 60 degrees north is 55,800 m, one of latitude 111,412 m (WGS 84)."""
-    flat = flattened(np.array([[60, 179.999], [60, -179.999], [60.001, 179.999]]))
-    assert flat[1] == pytest.approx([111.6, 0], abs=0.01)
-    assert flat[2] == pytest.approx([0, 111.41], abs=0.01)
+    projected = geodetic_to_plane(np.array([[60, 179.999], [60, -179.999], [60.001, 179.999]]))
+    assert projected[1] == pytest.approx([111.6, 0], abs=0.01)
+    assert projected[2] == pytest.approx([0, 111.41], abs=0.01)
 
 
-def test_an_antenna_is_where_tf_says(tmp_path: Path) -> None:
+def test_lever_arm_of_the_antenna_is_read_from_tf(tmp_path: Path) -> None:
     mounted = transforms("/tf_static", (0, "base_link", "antenna", Pose2D(0.5, 0, 0)))
     with log_of(
         tmp_path / "a.mcap",
         STRAIGHT,
         COMPASS,
-        points("/gps", *((t, x + 5, 7) for t, x in WAY), frame="antenna"),
+        points("/gps", *((t, x + 5, 7) for t, x in DRIVE_X), frame="antenna"),
         mounted,
     ) as log:
-        found = Localizer(log).locate(TIMES, FUSED)
-        assert found.poses[:, 0] == pytest.approx([4.5, 5.5, 6.5], abs=0.05)
+        located = Localizer(log).locate(TIMES, FUSED)
+        assert located.poses[:, 0] == pytest.approx([4.5, 5.5, 6.5], abs=0.05)
 
 
-def test_a_log_reader_is_enough_for_a_gps(tmp_path: Path) -> None:
-    with LogReader(log_of(tmp_path / "a.mcap", STRAIGHT).path) as log:
+def test_log_without_sensors_has_no_gps_and_no_compass(tmp_path: Path) -> None:
+    with open_log(log_of(tmp_path / "a.mcap", STRAIGHT).path) as log:
         assert find_gps(log) is None and find_compass(log) is None

@@ -1,0 +1,114 @@
+"""The noise parameters of a filter by maximum likelihood of its innovations.
+
+The log-likelihood of all measurements is the sum of those of the filter's innovations (prediction error
+decomposition: Schweppe, 1965). Its gradient is taken by central differences, and the information matrix from the
+outer products of the single nodes' gradients (Berndt, Hall, Hall and Hausman, 1974). Standard deviations are changed
+in the logarithm, the heading bias as it is.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+
+import numpy as np
+
+from prim.arrays import FloatArray
+from prim.se2 import wrap_angle
+from replay.poses.fusion_options import NoiseEstimationOptions
+from replay.poses.kalman import HEADING_BIAS
+
+
+class NoiseEstimator:
+    """Maximises the likelihood of noise parameters (5,), which kalman.FIX_STD and so on index.
+
+    Args:
+        costs: Returns minus twice each node's log-likelihood (N,), given the parameters.
+        options: Prior, steps and tolerances.
+    """
+
+    def __init__(self, costs: Callable[[FloatArray], FloatArray], options: NoiseEstimationOptions) -> None:
+        self._costs = costs
+        self._options = options
+
+    def maximize(self, initial: FloatArray, free: Sequence[int]) -> FloatArray:
+        """Maximise the posterior by scoring steps, which are halved where they overshoot.
+
+        Args:
+            initial: Where the search starts (5,), and where the prior has its mode.
+            free: The indices of the parameters to be estimated.
+
+        Returns:
+            The parameters (5,).
+        """
+        options = self._options
+        noise = initial.copy()
+        cost = self._penalized_cost(noise, initial, free)
+        for _ in range(options.max_iterations):
+            step = self._scoring_step(noise, initial, free)
+            share = 1.0
+            while share > options.min_step_share:
+                candidate = self._changed(noise, free, share * step)
+                candidate_cost = self._penalized_cost(candidate, initial, free)
+                if candidate_cost <= cost:
+                    break
+                share /= 2
+            else:
+                break
+            noise, cost = candidate, candidate_cost
+            if np.abs(share * step).max() < options.tolerance:
+                break
+        return noise
+
+    def is_significant(self, noise: FloatArray, parameter: int) -> bool:
+        """Test by its score whether a parameter differs from its value in ``noise`` (Rao, 1948).
+
+        Args:
+            noise: The parameters (5,), the others at their maximum.
+            parameter: The index of the one to be tested.
+
+        Returns:
+            Whether the score statistic exceeds the threshold of the options.
+        """
+        scores = self._node_scores(noise, [parameter])[:, 0]
+        return bool(scores.sum() ** 2 > self._options.score_threshold * (scores**2).sum())
+
+    def _scoring_step(self, noise: FloatArray, initial: FloatArray, free: Sequence[int]) -> FloatArray:
+        options = self._options
+        scores = self._node_scores(noise, free)
+        prior_score = -_log_ratios(noise, initial, free) / options.prior_log_std**2
+        prior_information = [0.0 if index == HEADING_BIAS else options.prior_log_std**-2 for index in free]
+        information = scores.T @ scores + np.diag(prior_information) + options.ridge * np.eye(len(free))
+        step = np.linalg.solve(information, scores.sum(axis=0) + prior_score)
+        limited: FloatArray = np.clip(step, -options.max_step, options.max_step)
+        return limited
+
+    def _penalized_cost(self, noise: FloatArray, initial: FloatArray, free: Sequence[int]) -> float:
+        """Return minus twice the log-posterior, up to a constant."""
+        prior = (_log_ratios(noise, initial, free) ** 2).sum() / self._options.prior_log_std**2
+        return float(self._costs(noise).sum() + prior)
+
+    def _node_scores(self, noise: FloatArray, free: Sequence[int]) -> FloatArray:
+        """Return the gradients (N, len(free)) of each node's log-likelihood, by central differences."""
+        columns = []
+        for index in free:
+            size = self._options.bias_difference if index == HEADING_BIAS else self._options.log_difference
+            above, below = (self._costs(self._changed(noise, [index], np.array([s]))) for s in (size, -size))
+            columns.append((below - above) / (4 * size))
+        return np.column_stack(columns)
+
+    def _changed(self, noise: FloatArray, free: Sequence[int], change: FloatArray) -> FloatArray:
+        """Add a change to some of the parameters: to the logarithm, except for the bias."""
+        changed = noise.copy()
+        for index, delta in zip(free, change.tolist(), strict=True):
+            if index == HEADING_BIAS:
+                changed[index] = wrap_angle(changed[index] + delta)
+            else:
+                std = changed[index] * math.exp(delta)
+                changed[index] = min(max(std, self._options.min_std), self._options.max_std)
+        return changed
+
+
+def _log_ratios(noise: FloatArray, initial: FloatArray, free: Sequence[int]) -> FloatArray:
+    """Return the logarithms' differences from their initial values; 0 for the bias, which has no prior."""
+    return np.array([0.0 if index == HEADING_BIAS else math.log(noise[index] / initial[index]) for index in free])
