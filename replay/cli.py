@@ -9,7 +9,6 @@ import time
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass
-from enum import StrEnum
 from itertools import takewhile
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -17,12 +16,14 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from prim import __version__, console
+from prim.choices import MapperName, PoseSourceName, SensorModelName
 from prim.errors import PrimError, UsageError
 
 if TYPE_CHECKING:
+    from prim.se2 import Pose2D
     from prim.world import Bounds
     from replay.options import ReplayOptions
-    from replay.poses.localize import FuseOptions
+    from replay.poses.fusion_options import FusionInputs
     from replay.result import ReplayResult
     from replay.viewer_protocol import Viewer, ViewerOptions
 
@@ -30,31 +31,6 @@ PARTLY_LOST = 3
 """The exit code when part of a log could not be read."""
 
 app = typer.Typer(add_completion=False, rich_markup_mode=None)
-
-
-class MapperName(StrEnum):
-    """The mappers."""
-
-    DET = "det"
-    PROB = "prob"
-    FORWARD = "forward"
-
-
-class SensorModelName(StrEnum):
-    """The inverse sensor models of ``prob``."""
-
-    EQ4 = "eq4"
-    GAUSSIAN = "gaussian"
-
-
-class PoseName(StrEnum):
-    """The sources of poses."""
-
-    AUTO = "auto"
-    TRUTH = "truth"
-    TF = "tf"
-    ODOM = "odom"
-    FUSED = "fused"
 
 
 def _show_version(wanted: bool) -> None:
@@ -67,7 +43,7 @@ def _show_version(wanted: bool) -> None:
 def replay(
     logs: Annotated[list[Path], typer.Argument(metavar="LOG...", help="MCAP logs, or folders of ROS 2 bags.")],
     mapper: Annotated[MapperName, typer.Option(help="How the map is made.")] = MapperName.PROB,
-    pose: Annotated[PoseName, typer.Option(help="Where poses come from.")] = PoseName.AUTO,
+    pose: Annotated[PoseSourceName, typer.Option(help="Where poses come from.")] = PoseSourceName.AUTO,
     resolution: Annotated[float, typer.Option(metavar="M", help="Side of a cell, metres.")] = 0.01,
     bounds: Annotated[str, typer.Option(metavar="auto or X0 Y0 X1 Y1", help="The map's bounds, metres.")] = "auto",
     scan_topic: Annotated[str | None, typer.Option(metavar="T", help="The topic of scans.")] = None,
@@ -164,18 +140,13 @@ def replay(
 
     Each log leaves a recording and a report in this folder: NAME.MAPPER.rrd and NAME.MAPPER.report.json.
     """
-    from prim.se2 import Pose2D
     from replay.options import ReplayOptions
     from replay.selection import Selection
     from replay.viewer_protocol import ViewerOptions
 
-    shown = ViewerOptions(save, spawn, connect, serve, live=rate is not None)
-    if no_viewer and (shown != ViewerOptions(live=shown.live) or map_every or detect_every):
+    viewer = ViewerOptions(save, spawn, connect, serve, live=rate is not None)
+    if no_viewer and (viewer != ViewerOptions(live=viewer.live) or map_every or detect_every):
         raise UsageError("--no-viewer excludes --save, --spawn, --connect, --serve, --map-every and --detect-every")
-    given = Outputs(save, report, map_output, trajectory)
-    jobs = {log: given.named_after(log, mapper.value, not (no_viewer or shown.watched)) for log in logs}
-    check_apart(logs, list(jobs.values()))
-    offset = Pose2D(laser_offset[0], laser_offset[1], math.radians(laser_offset[2])) if laser_offset else None
     options = ReplayOptions(
         mapper=mapper.value,
         sensor_model=sensor_model.value,
@@ -185,7 +156,7 @@ def replay(
         bounds=_parse_bounds(bounds),
         scan_topic=scan_topic,
         odom_topic=odom_topic,
-        laser_offset=offset,
+        laser_offset=_laser_pose(laser_offset),
         max_range=max_range,
         standing_still=standing_still,
         fuse=_fuse_options(fuse, gps_topic, compass_topic, pose_noise, odom_noise),
@@ -200,21 +171,13 @@ def replay(
         weights=weights,
         recover=recover,
     )
-    codes = []
-    for log, outputs in jobs.items():
-        viewer = None if no_viewer else dataclasses.replace(shown, save=outputs.recording)
-        try:
-            codes.append(_replay_log(log, options, outputs, viewer, Talk(quiet, verbose)))
-        except PrimError as error:
-            if len(jobs) == 1:
-                raise
-            codes.append(console.complain("prim-replay", error, debug))
-    return next((code for code in (console.FAILED, console.USAGE, PARTLY_LOST) if code in codes), 0)
+    files = OutputFiles(save, report, map_output, trajectory)
+    return _replay_logs(logs, options, files, None if no_viewer else viewer, Verbosity(quiet, verbose, debug))
 
 
 @dataclass(frozen=True)
-class Outputs:
-    """The files a replay leaves; None for those that are not wanted or not named yet."""
+class OutputFiles:
+    """The files that a replay leaves; None for those that are not wanted or not named yet."""
 
     recording: Path | None
     report: Path | None
@@ -222,23 +185,64 @@ class Outputs:
     trajectory: Path | None
 
     @property
-    def files(self) -> list[Path]:
-        """All the files."""
+    def paths(self) -> list[Path]:
+        """The paths of all files."""
         from replay.exports import map_files
 
-        one_file = (self.recording, self.report, self.trajectory)
-        return [path for path in one_file if path] + (list(map_files(self.map)) if self.map else [])
+        single_files = (self.recording, self.report, self.trajectory)
+        return [path for path in single_files if path] + (list(map_files(self.map)) if self.map else [])
 
-    def named_after(self, log: Path, mapper: str, with_recording: bool) -> Outputs:
-        """Those of one log: what is not named gets a name in this folder."""
+    def named_after(self, log: Path, mapper: str, with_recording: bool) -> OutputFiles:
+        """Name the files that have no name yet after a log; they are written to the current folder.
+
+        Args:
+            log: The log.
+            mapper: The mapper.
+            with_recording: Whether a recording is wanted.
+
+        Returns:
+            The files of this log.
+        """
         stem = f"{log.resolve().name.removesuffix('.part').removesuffix('.mcap')}.{mapper}"
         recording = self.recording or (Path(f"{stem}.rrd") if with_recording else None)
         return dataclasses.replace(self, recording=recording, report=self.report or Path(f"{stem}.report.json"))
 
 
-def check_apart(logs: Sequence[Path], jobs: Sequence[Outputs]) -> None:
-    """Raises UsageError where a file would be written twice, or over a log."""
-    files = [path.resolve() for outputs in jobs for path in outputs.files]
+@dataclass(frozen=True)
+class Verbosity:
+    """How much is printed."""
+
+    quiet: bool
+    verbose: bool
+    debug: bool
+
+
+def _replay_logs(
+    logs: Sequence[Path],
+    options: ReplayOptions,
+    files: OutputFiles,
+    viewer: ViewerOptions | None,
+    verbosity: Verbosity,
+) -> int:
+    """Replay logs one after the other; return the exit code of the worst."""
+    with_recording = viewer is not None and not viewer.watched
+    jobs = {log: files.named_after(log, options.mapper, with_recording) for log in logs}
+    _check_distinct(logs, list(jobs.values()))
+    codes = []
+    for log, outputs in jobs.items():
+        shown = None if viewer is None else dataclasses.replace(viewer, save=outputs.recording)
+        try:
+            codes.append(_replay_log(log, options, outputs, shown, verbosity))
+        except PrimError as error:
+            if len(jobs) == 1:
+                raise
+            codes.append(console.print_error("prim-replay", error, verbosity.debug))
+    return next((code for code in (console.FAILED, console.USAGE, PARTLY_LOST) if code in codes), 0)
+
+
+def _check_distinct(logs: Sequence[Path], jobs: Sequence[OutputFiles]) -> None:
+    """Raise UsageError where a file would be written twice, or over a log."""
+    files = [path.resolve() for outputs in jobs for path in outputs.paths]
     inputs = {log.resolve() for log in logs}
     if len(inputs) < len(logs):
         raise UsageError("a log is named twice")
@@ -249,38 +253,28 @@ def check_apart(logs: Sequence[Path], jobs: Sequence[Outputs]) -> None:
             raise UsageError(f"{path} would be written twice: name the outputs, or replay the logs one by one")
 
 
-@dataclass(frozen=True)
-class Talk:
-    """How much is said on the terminal."""
-
-    quiet: bool
-    verbose: bool
-
-
-def _replay_log(log: Path, options: ReplayOptions, outputs: Outputs, shown: ViewerOptions | None, talk: Talk) -> int:
-    """Replays one log, writes its outputs, prints its table; returns the exit code."""
-    from replay.exports import check_writable, write_map, write_report, write_trajectory
+def _replay_log(
+    log: Path, options: ReplayOptions, outputs: OutputFiles, shown: ViewerOptions | None, verbosity: Verbosity
+) -> int:
+    """Replay one log, write its outputs and print its table; return the exit code."""
+    from replay.exports import check_writable
     from replay.pipeline import Pipeline
 
-    for path in outputs.files:
+    for path in outputs.paths:
         check_writable(path)
     viewer = _make_viewer(shown)
-    with console.progress_bar("scans", talk.quiet) as progress:
+    with console.progress_bar("scans", verbosity.quiet) as progress:
         result = Pipeline(log, options, viewer, progress).run()
-    if outputs.report:
-        write_report(outputs.report, result)
-    if outputs.map:
-        write_map(outputs.map, result.grid)
-    if outputs.trajectory:
-        write_trajectory(outputs.trajectory, result)
-    if not talk.quiet:
-        _print_result(result, outputs, talk.verbose)
+    _write_outputs(result, outputs)
+    if not verbosity.quiet:
+        _print_result(result, outputs, verbosity.verbose)
     if shown is not None and shown.serve:
         _keep_serving()
     return PARTLY_LOST if result.lost else 0
 
 
 def _make_viewer(shown: ViewerOptions | None) -> Viewer | None:
+    """Make the viewer; None where none is wanted."""
     if shown is None:
         return None
     from replay.viewer import RerunViewer
@@ -288,37 +282,69 @@ def _make_viewer(shown: ViewerOptions | None) -> Viewer | None:
     return RerunViewer(shown, announce=lambda line: typer.echo(line, err=True))
 
 
-def _print_result(result: ReplayResult, outputs: Outputs, verbose: bool) -> None:
+def _write_outputs(result: ReplayResult, outputs: OutputFiles) -> None:
+    """Write the report, the map and the trajectory, where they are wanted."""
+    from replay.exports import write_map, write_report, write_trajectory
+
+    if outputs.report:
+        write_report(outputs.report, result)
+    if outputs.map:
+        write_map(outputs.map, result.grid)
+    if outputs.trajectory:
+        write_trajectory(outputs.trajectory, result)
+
+
+def _print_result(result: ReplayResult, outputs: OutputFiles, verbose: bool) -> None:
+    """Print notes, rejected candidates if ``verbose``, the table, and where the outputs are."""
+    for note in result.notes:
+        typer.echo(f"note: {note}", err=True)
+    if verbose:
+        _print_rejected(result)
+    _print_table(result, verbose)
+    typer.echo("wrote: " + ", ".join(str(path) for path in outputs.paths))
+    if outputs.recording:
+        typer.echo(f"look:  rerun {outputs.recording}")
+
+
+def _print_rejected(result: ReplayResult) -> None:
+    """Print the candidates that were rejected, and why."""
+    rejections = result.detections.detections.rejected if result.detections else ()
+    for rejection in rejections:
+        what = f"{rejection.kind} at ({rejection.x:.2f}, {rejection.y:.2f}) m, score {rejection.score:.2f}"
+        typer.echo(f"rejected: {what}: {rejection.reason}", err=True)
+
+
+def _print_table(result: ReplayResult, verbose: bool) -> None:
+    """Print the table of the result; with the time of each stage if verbose."""
     from rich.console import Console
     from rich.table import Table
     from rich.text import Text
 
-    from replay.report import table
+    from replay.report import summary_rows
 
-    for note in result.notes:
-        typer.echo(f"note: {note}", err=True)
-    if verbose and result.sighting is not None:
-        for one in result.sighting.detections.rejected:
-            what = f"{one.kind} at ({one.x:.2f}, {one.y:.2f}) m, score {one.score:.2f}"
-            typer.echo(f"rejected: {what}: {one.reason}", err=True)
     rows = Table(show_header=False, box=None, pad_edge=False)
-    for name, value in table(result):
+    for name, value in summary_rows(result):
         rows.add_row(Text(name), Text(value))
     if verbose:
         for name, seconds in result.seconds.items():
             if seconds:
                 rows.add_row(Text(f"  {name}"), Text(f"{seconds:.3f} s"))
     Console(highlight=False, soft_wrap=True).print(rows)
-    typer.echo("wrote: " + ", ".join(str(path) for path in outputs.files))
-    if outputs.recording:
-        typer.echo(f"look:  rerun {outputs.recording}")
 
 
 def _keep_serving() -> None:
+    """Wait until the user ends a replay that is served."""
     typer.echo("the replay is done and still served: Ctrl-C ends it", err=True)
     with suppress(KeyboardInterrupt):
         while True:
             time.sleep(3600)
+
+
+def _laser_pose(offset: tuple[float, float, float] | None) -> Pose2D | None:
+    """Return the laser's pose on the robot from x, y (m) and an angle in degrees."""
+    from prim.se2 import Pose2D
+
+    return None if offset is None else Pose2D(offset[0], offset[1], math.radians(offset[2]))
 
 
 def _fuse_options(
@@ -327,10 +353,9 @@ def _fuse_options(
     compass_topic: str | None,
     pose_noise: tuple[float, float] | None,
     odom_noise: tuple[float, float] | None,
-) -> FuseOptions:
-    """What poses are fused from, and how noisy that is. Raises UsageError."""
-    from replay.poses.fusion import PoseNoise
-    from replay.poses.localize import SENSORS, FuseOptions
+) -> FusionInputs:
+    """Parse what poses are fused from and its noise, given in m and degrees. Raises UsageError."""
+    from replay.poses.fusion_options import SENSORS, FusionInputs, SensorNoise
 
     names = SENSORS if sensors is None else tuple(name.strip() for name in sensors.split(","))
     unknown = [name for name in names if name not in SENSORS]
@@ -341,19 +366,17 @@ def _fuse_options(
     for option, given in (("--pose-noise", pose_noise), ("--odom-noise", odom_noise)):
         if given is not None and not all(0 < value < math.inf for value in given):
             raise UsageError(f"{option} is {given[0]:g} {given[1]:g}: both must be above 0")
-    fixes, turns = pose_noise or (None, None)
-    metres, degrees = odom_noise or (None, None)
-    noise = PoseNoise(
-        fixes,
-        None if turns is None else math.radians(turns),
-        metres,
-        None if degrees is None else math.radians(degrees),
-    )
-    return FuseOptions(tuple(name for name in SENSORS if name in names), gps_topic, compass_topic, noise)
+    noise = SensorNoise(*_in_radians(pose_noise), *_in_radians(odom_noise))
+    return FusionInputs(tuple(name for name in SENSORS if name in names), gps_topic, compass_topic, noise)
+
+
+def _in_radians(noise: tuple[float, float] | None) -> tuple[float | None, float | None]:
+    """Convert noise from m and degrees to m and rad; None stays None."""
+    return (None, None) if noise is None else (noise[0], math.radians(noise[1]))
 
 
 def join_bounds(arguments: Sequence[str]) -> list[str]:
-    """Makes the numbers after ``--bounds`` one argument, since an option takes a fixed number of them."""
+    """Join the numbers after ``--bounds`` to one argument, since an option takes a fixed number of them."""
     joined = list(arguments)
     if "--bounds" in joined:
         at = joined.index("--bounds") + 1
@@ -363,6 +386,7 @@ def join_bounds(arguments: Sequence[str]) -> list[str]:
 
 
 def _parse_bounds(text: str) -> Bounds | None:
+    """Parse «auto» (None), or four numbers (m). Raises UsageError."""
     if text == "auto":
         return None
     numbers = text.split()

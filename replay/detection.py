@@ -1,44 +1,67 @@
-"""Primitives in a replay: which map the detector looks at, what it finds, and how right that is."""
+"""Detection in a replay: primitives in the map so far and in the final map, refined, tracked and evaluated."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
+from detect.networks.weights import shipped_weights
 from mapping.forward.mapper import cores
-from mapping.grid import OccupancyGrid
-from mapping.mapper import Mapper
+from mapping.grid import GridFrame, OccupancyGrid
+from mapping.mapper import Mapper, make_mapper
 from prim.arrays import FloatArray
+from prim.errors import UsageError
 from prim.metrics import DetectionErrors, detection_errors
-from prim.scan import Scan
+from prim.scan import PosedScan, Scan
 from prim.se2 import Pose2D
 from prim.shapes import Primitive
-from replay.ground_truth import Truth
+from replay.ground_truth import GroundTruth
+from replay.options import ReplayOptions
+from replay.posed_scans import PosedScans
+from replay.timing import StageTimer
 
 if TYPE_CHECKING:
     from detect.detection import Detections
     from detect.detector import Detector
+    from detect.refinement.refine import Effort
     from detect.tracker import Tracker
-
-SCANS_ON_THE_WAY = 30
-"""A look on the way is refined by so many of the scans to twice as many, evenly spread."""
-
-ASKED_AGAIN = 4
-"""On the way, what was sure of its kind is asked for it again when there are so many times as many scans."""
-
-PROPOSED, PROPOSED_FROM = 6, 40
-"""On the way, what the networks missed is looked for in so many things of the map, from so many scans on: maps of few
-scans are full of what might be one.
-"""
 
 
 @dataclass(frozen=True)
-class Identity:
-    """Which track a detection belongs to; ``std`` (m, rad) is the track's, by name, where looks were many."""
+class IntermediateOptions:
+    """How much work goes into detection before the last scan; all set by hand.
+
+    Attributes:
+        scans: Primitives are refined with the rays of this many scans, to twice as many.
+        kind_search_growth: Kinds of primitives whose kind was certain are compared again once the number of scans has
+            grown by this factor since they were last.
+        proposals: At most this many connected components of the map that the networks missed are tried.
+        proposals_from: None are tried before this many scans: maps of few scans are full of fragments.
+    """
+
+    scans: int = 30
+    kind_search_growth: int = 4
+    proposals: int = 6
+    proposals_from: int = 40
+
+
+INTERMEDIATE = IntermediateOptions()
+
+
+@dataclass(frozen=True)
+class TrackIdentity:
+    """The track that a detection belongs to.
+
+    Attributes:
+        id: The track's number.
+        confirmed: Whether the track is confirmed; tentative otherwise.
+        std: Standard deviations of the track's parameters by name (m, rad); None without a tracker.
+    """
 
     id: int
     confirmed: bool = True
@@ -46,146 +69,355 @@ class Identity:
 
 
 @dataclass(frozen=True)
-class Sighting:
-    """What was found in a map, each with its identity; where there is a truth, how it compares with that.
+class DetectionResult:
+    """The primitives detected in one map.
 
-    ``noise_std`` (m) is the range noise that refinement reckoned with; None where nothing was refined.
+    Attributes:
+        detections: The detections and the candidates that were rejected.
+        identities: The track of each detection.
+        noise_std: The range noise that refinement estimated or was given (m); None without refinement.
+        truth: The true primitives; empty without ground truth.
+        errors: How the detections compare with the truth; None without ground truth.
     """
 
     detections: Detections
-    identities: tuple[Identity, ...]
+    identities: tuple[TrackIdentity, ...]
     noise_std: float | None = None
     truth: tuple[Primitive, ...] = ()
     errors: DetectionErrors | None = None
 
 
-class Lookout:
-    """Looks for primitives with a detector: in the replay's map, or in one of its own where cells differ.
+class ScanSubset:
+    """A subset of the scans so far, evenly spread: ``size`` of them, to twice as many.
 
-    ``own`` is a mapper with cells of the size that the detector reads; None where the replay's own map has them.
-    With ``tracker``, for a detector that looks more than once, what is found keeps its id. With ``refines``, what is
-    found is fitted to the rays, whose noise is ``noise_std`` (m) where it is known; ``frame_covariance`` (3, 3) says
-    how unsure the map's own place is, which adds to what is told of each primitive's.
+    All are held at first. Whenever there are twice ``size``, every other one is dropped, and from then on half as
+    many are added.
+
+    Args:
+        size: The smallest number of scans that is held, once so many were added.
+
+    Attributes:
+        total: The number of scans that were added so far.
+    """
+
+    def __init__(self, size: int) -> None:
+        self.total = 0
+        self._size = size
+        self._stride = 1
+        self._selected = False
+        self._scans: list[list[tuple[Scan, Pose2D]]] = []
+
+    def add(self, scan: Scan, pose: Pose2D) -> None:
+        """Add a scan, or a piece of one: the later pieces of a scan are held where its first piece is.
+
+        Args:
+            scan: The scan or piece.
+            pose: The laser's pose.
+        """
+        if scan.first_beam:
+            if self._selected:
+                self._scans[-1].append((scan, pose))
+            return
+        self._selected = self.total % self._stride == 0
+        if self._selected:
+            self._scans.append([(scan, pose)])
+        self.total += 1
+        if len(self._scans) >= 2 * self._size:
+            self._scans = self._scans[::2]
+            self._stride *= 2
+
+    def pieces(self) -> list[tuple[Scan, Pose2D]]:
+        """Return the pieces of all scans that are held."""
+        return [piece for scan in self._scans for piece in scan]
+
+
+class DetectionRefiner:
+    """Fits detections to the rays of the scans, from a warm start where it was done before.
+
+    Args:
+        noise_std: The range noise (m); None to estimate it.
+        frame_covariance: The covariance (3, 3; m, rad) of the map frame's own pose, which adds to that of each
+            primitive; None where it is exact.
+        options: How much work goes into detection before the last scan.
     """
 
     def __init__(
         self,
-        detector: Detector,
-        own: Mapper | None,
-        truth: Truth | None,
-        tracker: Tracker | None = None,
-        refines: bool = False,
-        noise_std: float | None = None,
-        frame_covariance: FloatArray | None = None,
+        noise_std: float | None,
+        frame_covariance: FloatArray | None,
+        options: IntermediateOptions = INTERMEDIATE,
     ) -> None:
-        self._detector = detector
-        self._tracker = tracker
-        self._own = own
-        self._truth = truth
+        self.scans = ScanSubset(options.scans)
+        self._options = options
         self._noise_std = noise_std
         self._frame_covariance = frame_covariance
-        self._scans: list[list[tuple[Scan, Pose2D]]] = []
-        self._keeps = False
-        self._before: tuple[Detections, float | None] | None = None
-        self._count, self._stride = 0, 1
-        self._searched_at = 0
-        self.refines = refines
+        self._previous: tuple[Detections, float | None] | None = None
+        self._kind_search_at = 0
 
-    def keep(self, scan: Scan, pose: Pose2D) -> None:
-        """Adds a scan to the detector's own map, for a look at the end."""
-        if self._own is not None:
-            self._own.keep(scan, pose)
+    def refine_so_far(self, detections: Detections, grid: OccupancyGrid) -> tuple[Detections, float | None]:
+        """Refine detections before the last scan, with the rays of a subset of the scans.
 
-    def update(self, scan: Scan, pose: Pose2D) -> None:
-        """Adds a scan to the detector's own map, for looks on the way."""
-        if self.refines:
-            self._keep_some(scan, pose)
-        if self._own is not None:
-            self._own.update(scan, pose)
+        Primitives whose kind was certain the last time start from there, and keep their kind (warm start), unless
+        the number of scans has grown enough to search all kinds again.
 
-    def _keep_some(self, scan: Scan, pose: Pose2D) -> None:
-        """Keeps scans for looks on the way, evenly spread: every other one goes where they become too many."""
-        if scan.first_beam:
-            if self._keeps:
-                self._scans[-1].append((scan, pose))
-            return
-        self._keeps = self._count % self._stride == 0
-        if self._keeps:
-            self._scans.append([(scan, pose)])
-        self._count += 1
-        if len(self._scans) >= 2 * SCANS_ON_THE_WAY:
-            self._scans = self._scans[::2]
-            self._stride *= 2
+        Args:
+            detections: What the networks found.
+            grid: The map so far, which they found it in.
 
-    def map_so_far(self, mapper: Mapper) -> OccupancyGrid:
-        """The map that the detector looks at on the way."""
-        return (self._own or mapper).grid()
+        Returns:
+            The refined detections and the range noise (m), None where no ray passes any of them.
+        """
+        from detect.refinement.refine import Effort, WarmStart
 
-    def last_map(self, grid: OccupancyGrid) -> OccupancyGrid:
-        """The map that the detector looks at in the end, where the replay's own is ``grid``."""
-        return grid if self._own is None else self._own.finish()
-
-    def detect(self, grid: OccupancyGrid) -> Detections:
-        """What the networks find in a map."""
-        return self._detector.detect(grid)
+        search_kinds = self.scans.total >= self._options.kind_search_growth * self._kind_search_at
+        if search_kinds:
+            self._kind_search_at = self.scans.total
+        proposals = self._options.proposals if self.scans.total >= self._options.proposals_from else 0
+        warm_start = None if search_kinds or self._previous is None else WarmStart(*self._previous)
+        effort = Effort(warm_start, proposals, rounds=0)
+        self._previous = self._refine(detections, grid, self.scans.pieces(), effort)
+        return self._with_frame_uncertainty(self._previous[0]), self._previous[1]
 
     def refine(
-        self, detections: Detections, grid: OccupancyGrid, scans: Iterable[tuple[Scan, Pose2D]] | None = None
+        self, detections: Detections, grid: OccupancyGrid, scans: Iterable[tuple[Scan, Pose2D]]
     ) -> tuple[Detections, float | None]:
-        """Detections fitted to the rays of all ``scans``, or of those so far; and the noise (m) of these rays.
+        """Refine detections with the rays of all scans.
 
-        On the way some of the scans do, and what was sure of its kind at the last look is asked for it again only
-        when there are ASKED_AGAIN times as many scans as when it was asked last.
+        Args:
+            detections: What the networks found.
+            grid: The map that they found it in.
+            scans: The pieces of all scans, with the laser's poses.
+
+        Returns:
+            The refined detections and the range noise (m), None where no ray passes any of them.
         """
-        from detect.refinement.refine import (  # when it is needed: a replay without it starts faster
-            Pace,
-            refine_detections,
-        )
+        from detect.refinement.refine import THOROUGH
 
-        if scans is not None:
-            refined, noise_std = refine_detections(detections, scans, grid, self._noise_std, cores())
-            return self._in_unsure_frame(refined), noise_std
-        anew = self._count >= ASKED_AGAIN * self._searched_at
-        if anew:
-            self._searched_at = self._count
-        some = [part for scan in self._scans for part in scan]
-        most = PROPOSED if self._count >= PROPOSED_FROM else 0
-        pace = Pace(None if anew else self._before, most, rounds=0)
-        refined, noise_std = refine_detections(detections, some, grid, self._noise_std, cores(), pace)
-        self._before = refined, noise_std
-        return self._in_unsure_frame(refined), noise_std
+        refined, noise_std = self._refine(detections, grid, scans, THOROUGH)
+        return self._with_frame_uncertainty(refined), noise_std
 
-    def _in_unsure_frame(self, detections: Detections) -> Detections:
-        """Detections with what is told of their place and angle as unsure as the map's frame makes it."""
+    def _refine(
+        self, detections: Detections, grid: OccupancyGrid, scans: Iterable[tuple[Scan, Pose2D]], effort: Effort
+    ) -> tuple[Detections, float | None]:
+        # imported when it is needed: a replay without refinement starts faster
+        from detect.refinement.refine import refine_detections
+
+        return refine_detections(detections, scans, grid, self._noise_std, cores(), effort)
+
+    def _with_frame_uncertainty(self, detections: Detections) -> Detections:
+        """Add the uncertainty of the map frame's pose to that of the detections."""
         if self._frame_covariance is None:
             return detections
         found = tuple(
-            one
-            if one.std is None
-            else replace(one, std=spread_by_frame(one.primitive, one.std, self._frame_covariance))
-            for one in detections.found
+            detection
+            if detection.std is None
+            else replace(
+                detection, std=add_frame_uncertainty(detection.primitive, detection.std, self._frame_covariance)
+            )
+            for detection in detections.found
         )
         return replace(detections, found=found)
 
-    def sighting(self, detections: Detections, stamp: int, noise_std: float | None = None) -> Sighting:
-        """Detections with their identities, held against the truth at ``stamp`` (ns) where there is one."""
-        identities = self._identities(detections)
-        if self._truth is None:
-            return Sighting(detections, identities, noise_std)
-        true = tuple(self._truth.at(stamp).primitives)
-        errors = detection_errors([one.primitive for one in detections.found], true)
-        return Sighting(detections, identities, noise_std, true, errors)
 
-    def _identities(self, detections: Detections) -> tuple[Identity, ...]:
-        """The detections' tracks; one after the other where there is one look only."""
+class DetectionStage:
+    """Detects primitives while a log is replayed: in the map so far at intervals, and in the final map.
+
+    Args:
+        detector: The networks.
+        options: Options of the replay.
+        frame: The frame of the replay's map.
+        truth: The true world in that frame; None where it is not known.
+        frame_covariance: The covariance (3, 3; m, rad) of the map frame's own pose; None where it is exact.
+        timer: Counts the time towards the stages «detect» and «refine».
+    """
+
+    skipped: str | None = None
+
+    def __init__(
+        self,
+        detector: Detector,
+        options: ReplayOptions,
+        frame: GridFrame,
+        truth: GroundTruth | None,
+        frame_covariance: FloatArray | None,
+        timer: StageTimer,
+    ) -> None:
+        self._detector = detector
+        self._interval = options.detect_every
+        self._own_mapper = _own_mapper(detector, options, frame)
+        self._refiner = DetectionRefiner(options.noise_std, frame_covariance) if options.refine else None
+        self._tracker = _tracker() if self._interval else None
+        self._truth = truth
+        self._timer = timer
+
+    @property
+    def streaming(self) -> bool:
+        """Whether primitives are detected before the last scan."""
+        return self._interval is not None
+
+    def update(self, posed: PosedScan, mapper: Mapper) -> DetectionResult | None:
+        """Add a scan, and detect primitives in the map so far where that is due.
+
+        Args:
+            posed: The scan, which the replay's map has already.
+            mapper: The replay's mapper.
+
+        Returns:
+            What was detected; None where no detection is due.
+        """
+        with self._timer.stage("detect"):
+            self._add(posed)
+            if not self._interval or (posed.position + 1) % self._interval:
+                return None
+            grid = (self._own_mapper or mapper).grid()
+            detections = self._detector.detect(grid)
+        noise_std = None
+        if self._refiner:
+            with self._timer.stage("refine"):
+                detections, noise_std = self._refiner.refine_so_far(detections, grid)
+        return self._result(detections, posed.scan.stamp, noise_std)
+
+    def finish(self, grid: OccupancyGrid, posed_scans: PosedScans) -> DetectionResult | None:
+        """Detect primitives in the final map.
+
+        Args:
+            grid: The replay's map of all scans.
+            posed_scans: All scans.
+
+        Returns:
+            What was detected.
+        """
+        with self._timer.stage("detect"):
+            if self._own_mapper is not None:
+                grid = self._own_mapper.finish()
+            detections = self._detector.detect(grid)
+        noise_std = None
+        if self._refiner:
+            pieces = (piece for posed in posed_scans for piece in posed.pieces)
+            with self._timer.stage("refine"):
+                detections, noise_std = self._refiner.refine(detections, grid, pieces)
+        return self._result(detections, int(posed_scans.scan_log.stamps[-1]), noise_std)
+
+    def _add(self, posed: PosedScan) -> None:
+        """Add a scan to the detector's own map, and to those that refine detections before the last scan."""
+        for scan, pose in posed.pieces:
+            if self._refiner and self.streaming:
+                self._refiner.scans.add(scan, pose)
+            if self._own_mapper is not None:
+                (self._own_mapper.update if self.streaming else self._own_mapper.accumulate)(scan, pose)
+
+    def _result(self, detections: Detections, stamp: int, noise_std: float | None) -> DetectionResult:
+        """Identify the detections' tracks, and evaluate them against the truth at ``stamp`` (ns)."""
+        with self._timer.stage("detect"):
+            identities = self._identities(detections)
+            if self._truth is None:
+                return DetectionResult(detections, identities, noise_std)
+            truth = tuple(self._truth.at(stamp).primitives)
+            errors = detection_errors([detection.primitive for detection in detections.found], truth)
+            return DetectionResult(detections, identities, noise_std, truth, errors)
+
+    def _identities(self, detections: Detections) -> tuple[TrackIdentity, ...]:
+        """Return the track of each detection; without a tracker, number them in their order."""
         if self._tracker is None:
-            return tuple(Identity(number) for number in range(1, len(detections.found) + 1))
+            return tuple(TrackIdentity(number) for number in range(1, len(detections.found) + 1))
         tracks = self._tracker.update(detections.found)
-        return tuple(Identity(track.id, track.confirmed, track.std) for track in tracks)
+        return tuple(TrackIdentity(track.id, track.confirmed, track.std) for track in tracks)
 
 
-def spread_by_frame(primitive: Primitive, std: Mapping[str, float], covariance: FloatArray) -> dict[str, float]:
-    """Standard deviations (m, rad, by name) of a primitive in a frame whose own place has a ``covariance`` (3, 3)."""
-    moved = np.array([[1, 0, -primitive.y], [0, 1, primitive.x], [0, 0, 1]])
-    added = dict(zip(("x", "y", "theta"), np.diag(moved @ covariance @ moved.T).tolist(), strict=True))
+class NoDetection:
+    """The stage of a replay that does not detect.
+
+    Args:
+        skipped: Why detection is not possible, where it was wanted; None where it was not.
+    """
+
+    streaming = False
+
+    def __init__(self, skipped: str | None = None) -> None:
+        self.skipped = skipped
+
+    def update(self, posed: PosedScan, mapper: Mapper) -> None:
+        """See :meth:`DetectionStage.update`."""
+
+    def finish(self, grid: OccupancyGrid, posed_scans: PosedScans) -> None:
+        """See :meth:`DetectionStage.finish`."""
+
+
+def make_detection_stage(
+    options: ReplayOptions,
+    frame: GridFrame,
+    truth: GroundTruth | None,
+    frame_covariance: FloatArray | None,
+    timer: StageTimer,
+) -> DetectionStage | NoDetection:
+    """Make the stage that detects, with the weights that are named or those that come with prim.
+
+    Args:
+        options: Options of the replay.
+        frame: The frame of the replay's map.
+        truth: The true world in that frame; None where it is not known.
+        frame_covariance: The covariance (3, 3; m, rad) of the map frame's own pose; None where it is exact.
+        timer: Counts the time of loading towards the stage «detect».
+
+    Returns:
+        The stage; a :class:`NoDetection` where detection is not wanted, or not possible and not explicitly asked for.
+
+    Raises:
+        UsageError: Detection was explicitly asked for, by weights or an interval, and is not possible.
+    """
+    if not options.detect:
+        return NoDetection()
+    explicit = options.weights is not None or options.detect_every is not None
+    weights = options.weights or shipped_weights(options.mapper)
+    try:
+        if weights is None:
+            raise UsageError(f"no weights for maps of {options.mapper} come with prim: give --weights")
+        detector = _load(weights, options.mapper, timer)
+        return DetectionStage(detector, options, frame, truth, frame_covariance, timer)
+    except UsageError as error:
+        if explicit:
+            raise
+        return NoDetection(str(error))
+
+
+def _load(weights: Path, mapper: str, timer: StageTimer) -> Detector:
+    from detect.detector import Detector  # when it is needed: a replay without detection starts faster
+
+    with timer.stage("detect"):
+        return Detector.load(weights, mapper)
+
+
+def _tracker() -> Tracker:
+    from detect.tracker import Tracker
+
+    return Tracker()
+
+
+def _own_mapper(detector: Detector, options: ReplayOptions, frame: GridFrame) -> Mapper | None:
+    """Make a mapper of the kind and the cells that the detector was trained on; None where the replay's has both."""
+    cell = detector.card.resolution
+    if np.isclose(options.resolution, cell, rtol=1e-6) and options.sensor_model == "eq4":
+        return None
+    noise_std = options.noise_std if options.mapper == "forward" else None
+    return make_mapper(options.mapper, cell, GridFrame.covering(frame.bounds, cell).bounds, "eq4", noise_std)
+
+
+def add_frame_uncertainty(
+    primitive: Primitive, std: Mapping[str, float], frame_covariance: FloatArray
+) -> dict[str, float]:
+    """Add the uncertainty of the map frame's own pose to a primitive's.
+
+    The pose of a primitive at (x, y) changes with the frame's by the Jacobian [[1, 0, -y], [0, 1, x], [0, 0, 1]].
+
+    Args:
+        primitive: The primitive.
+        std: Standard deviations of its parameters in the map frame, by name (m, rad).
+        frame_covariance: The covariance (3, 3; m, rad) of the frame's pose.
+
+    Returns:
+        The standard deviations with both added in quadrature, by name (m, rad).
+    """
+    jacobian = np.array([[1, 0, -primitive.y], [0, 1, primitive.x], [0, 0, 1]])
+    variances = np.diag(jacobian @ frame_covariance @ jacobian.T).tolist()
+    added = dict(zip(("x", "y", "theta"), variances, strict=True))
     return {name: math.sqrt(value**2 + added.get(name, 0.0)) for name, value in std.items()}

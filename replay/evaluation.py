@@ -1,4 +1,4 @@
-"""A replay held against the truth that its log has: maps and poses."""
+"""Evaluation of a replay against the log's ground truth: maps and poses."""
 
 from __future__ import annotations
 
@@ -6,63 +6,84 @@ import numpy as np
 
 from mapping.grid import GridFrame, OccupancyGrid
 from mapping.map_metrics import MapScores
-from mapping.reference_map import TruthMap
+from mapping.reference_map import ReferenceMap
 from prim.metrics import pose_nees, pose_rmse
-from prim.scan import Scan
+from prim.scan import PosedScan
 from prim.se2 import Pose2D
 from prim.shapes import angle_difference
-from replay.ground_truth import Truth
-from replay.poses.localize import STILL, LaserPoses
+from prim.world import World
+from replay.ground_truth import GroundTruth
+from replay.poses.laser_poses import STILL, LaserPoses
 
 
-class Judge:
-    """Holds the replay against the truth, where the log has one."""
+class ReplayEvaluator:
+    """Compares maps and poses with the ground truth, where the log has one.
+
+    Args:
+        frame: The frame of the maps that are scored.
+        truth: The true world; None where the log has none.
+        poses: The laser's poses that the replay uses.
+        true_poses: The laser's true poses; None where the log has none.
+    """
 
     def __init__(
-        self, frame: GridFrame, truth: Truth | None, poses: LaserPoses, true_poses: LaserPoses | None
+        self, frame: GridFrame, truth: GroundTruth | None, poses: LaserPoses, true_poses: LaserPoses | None
     ) -> None:
         self._truth = truth
         self._poses = poses
         self._true_poses = true_poses
-        self._map = TruthMap(frame) if truth is not None and true_poses is not None else None
+        self._reference = ReferenceMap(frame) if truth is not None and true_poses is not None else None
 
     @property
     def scores_maps(self) -> bool:
-        """Whether the map is held against the true world."""
-        return self._map is not None
+        """Whether maps are scored: the true world and the true poses are known."""
+        return self._reference is not None
 
     @property
     def compares_poses(self) -> bool:
-        """Whether the poses are other than the true ones, and held against them."""
+        """Whether true poses are known and the replay uses others."""
         return self._true_poses is not None and (self._poses.matched or self._poses.source not in ("truth", STILL))
 
-    def update(self, position: int, scan: Scan, stamp: int) -> None:
-        """Adds what a perfect sensor would have seen."""
+    @property
+    def comparable_truth(self) -> GroundTruth | None:
+        """The true world in the frame of the map; None where either is not known."""
+        return self._truth if self.scores_maps else None
+
+    def world(self, stamp: int) -> World | None:
+        """Return the true world at ``stamp`` (ns); None where the log has none."""
+        return None if self._truth is None else self._truth.at(stamp)
+
+    def update(self, posed: PosedScan) -> None:
+        """Add the noise-free rays of a scan, cast in the true world from the true pose, to the reference map."""
         true = self._true_poses
-        if self._map is None or self._truth is None or true is None or not true.valid[position]:
+        if self._reference is None or self._truth is None or true is None or not true.valid[posed.position]:
             return
-        self._map.update(scan, Pose2D(*true.poses[position].tolist()), self._truth.at(stamp))
+        pose = Pose2D(*true.poses[posed.position].tolist())
+        self._reference.update(posed.scan, pose, self._truth.at(posed.scan.stamp))
 
     def score(self, grid: OccupancyGrid) -> MapScores | None:
-        """Scores of the map so far; None without truth."""
-        return None if self._map is None else self._map.score(grid.probability)
+        """Score a map against the reference map of the scans so far; None without ground truth."""
+        return None if self._reference is None else self._reference.score(grid.probability)
 
     def pose_error(self, position: int) -> tuple[float, float] | None:
-        """Position (m) and heading (rad) error of one scan's pose; None where poses are not compared."""
+        """Return one scan's position (m) and heading (rad) error; None where poses are not compared."""
         if self._true_poses is None or not self.compares_poses or not self._true_poses.valid[position]:
             return None
         pose, true = self._poses.poses[position], self._true_poses.poses[position]
         return float(np.hypot(*(pose - true)[:2])), abs(angle_difference(float(pose[2]), float(true[2])))
 
     def pose_rmse(self) -> tuple[float, float] | None:
-        """Root mean square position (m) and heading (rad) errors; None where poses are not compared."""
+        """Return the root mean square position (m) and heading (rad) errors; None where poses are not compared."""
         if self._true_poses is None or not self.compares_poses:
             return None
         both = self._poses.valid & self._true_poses.valid
         return pose_rmse(self._poses.poses[both], self._true_poses.poses[both]) if both.any() else None
 
     def pose_nees(self) -> float | None:
-        """The mean normalised error squared: 3 where the covariances are right; None where there are none."""
+        """Return the mean normalized estimation error squared of the poses; None without covariances or truth.
+
+        Its expectation is 3, the degrees of freedom, where the covariances are right.
+        """
         if self._true_poses is None or self._poses.covariances is None:
             return None
         both = self._poses.valid & self._true_poses.valid

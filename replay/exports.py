@@ -1,4 +1,4 @@
-"""A replay's results as files: the report, the map, the trajectory."""
+"""The result of a replay as files: the report, the map, the trajectory."""
 
 from __future__ import annotations
 
@@ -13,12 +13,18 @@ import numpy as np
 
 from mapping.grid import OccupancyGrid
 from prim.errors import OutputError
-from replay.report import report
+from replay.report import report_json
 from replay.result import ReplayResult
+
+FREE_THRESHOLD, OCCUPIED_THRESHOLD = 0.196, 0.65
+OCCUPIED_VALUE, UNKNOWN_VALUE, FREE_VALUE = 0, 205, 254
+"""nav2's map_server takes cells whose 1 - value / 255 is below the first threshold for free, and above the second for
+occupied; 205 is 0.19608, between them.
+"""
 
 
 def check_writable(path: Path) -> None:
-    """Raises OutputError where a file could not be written, before the work that would be lost."""
+    """Raise OutputError where a file cannot be written, before the work that would be lost."""
     with _writing(path):
         if path.is_dir():
             raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR))
@@ -29,14 +35,21 @@ def check_writable(path: Path) -> None:
 
 
 def write_map(stem: Path, grid: OccupancyGrid) -> None:
-    """Writes ``stem.pgm`` and ``stem.yaml`` as nav2's map_server reads them. Raises OutputError.
+    """Write a map as nav2's map_server reads it: an image in PGM, and its description in YAML.
 
-    An image's first row is the map's largest y. Cells called occupied are black, free ones white, unknown
-    ones 205, which its ``trinary`` mode reads back as they were.
+    The image's first row is at the map's largest y. Occupied cells are black, free ones white, and unknown ones have
+    the value that map_server's mode «trinary» reads back as unknown.
+
+    Args:
+        stem: The path of both files, with or without either's suffix.
+        grid: The map.
+
+    Raises:
+        OutputError: A file cannot be written.
     """
-    image = np.full(grid.frame.shape, 205, dtype=np.uint8)
-    image[grid.free] = 254
-    image[grid.occupied] = 0
+    image = np.full(grid.frame.shape, UNKNOWN_VALUE, dtype=np.uint8)
+    image[grid.free] = FREE_VALUE
+    image[grid.occupied] = OCCUPIED_VALUE
     rows, cols = grid.frame.shape
     pgm, yaml = map_files(stem)
     x, y = grid.frame.origin
@@ -52,7 +65,15 @@ def write_map(stem: Path, grid: OccupancyGrid) -> None:
 
 
 def write_trajectory(path: Path, result: ReplayResult) -> None:
-    """Writes the laser's poses in TUM's format (stamp x y z qx qy qz qw). Raises OutputError."""
+    """Write the laser's poses in TUM's format (stamp x y z qx qy qz qw; s, m).
+
+    Args:
+        path: The file.
+        result: The replay whose poses are written.
+
+    Raises:
+        OutputError: The file cannot be written.
+    """
     lines = []
     for stamp, pose, valid in zip(result.stamps.tolist(), result.poses.poses, result.poses.valid, strict=True):
         if valid:
@@ -64,7 +85,7 @@ def write_trajectory(path: Path, result: ReplayResult) -> None:
 
 
 def map_files(stem: Path) -> tuple[Path, Path]:
-    """The image and the description of a map that is called ``stem``, with or without either's suffix."""
+    """Return the paths of a map's image and its description; ``stem`` may have either's suffix."""
     name = stem.name.removesuffix(".yaml").removesuffix(".pgm")
     return stem.with_name(f"{name}.pgm"), stem.with_name(f"{name}.yaml")
 
@@ -77,11 +98,15 @@ def _writing(path: Path) -> Iterator[None]:
         raise OutputError(path, error) from error
 
 
-FREE_THRESHOLD, OCCUPIED_THRESHOLD = 0.196, 0.65
-"""nav2's map_server calls cells below the one free and above the other occupied; 205 is 0.19608, unknown."""
-
-
 def write_report(path: Path, result: ReplayResult) -> None:
-    """Writes the report as JSON. Raises OutputError."""
+    """Write the report as JSON.
+
+    Args:
+        path: The file.
+        result: The replay to report on.
+
+    Raises:
+        OutputError: The file cannot be written.
+    """
     with _writing(path):
-        path.write_text(json.dumps(report(result), indent=2) + "\n", encoding="utf-8")
+        path.write_text(json.dumps(report_json(result), indent=2) + "\n", encoding="utf-8")

@@ -1,4 +1,4 @@
-"""The truth a recorded log holds: exact primitives and walls over time."""
+"""The ground truth of a recorded log: exact primitives and walls over time."""
 
 from __future__ import annotations
 
@@ -7,24 +7,31 @@ import json
 from dataclasses import replace
 
 from prim.errors import WorldError
-from prim.log.mcap import LogReader
 from prim.log.messages import MARKERS_TYPE, TRUE_PRIMITIVES_TOPIC, decode_primitives
+from prim.log.source import LogSource
 from prim.world import World
 
 
-class Truth:
-    """The true world at any time: walls and floor from ``world.json``, primitives as they were last logged."""
+class GroundTruth:
+    """The true world at any time: walls and floor from ``world.json``, primitives as they were last logged.
 
-    def __init__(self, world: World, moved: list[tuple[int, World]]) -> None:
+    Args:
+        world: The world that the log describes as a whole.
+        changes: Stamps (ns), ascending, and the worlds that hold from them on.
+    """
+
+    def __init__(self, world: World, changes: list[tuple[int, World]]) -> None:
         self.world = world
-        self._stamps = [stamp for stamp, _ in moved]
-        self._worlds = [world for _, world in moved]
+        self._stamps = [stamp for stamp, _ in changes]
+        self._worlds = [changed for _, changed in changes]
 
     @classmethod
-    def read(cls, log: LogReader) -> Truth | None:
-        """The log's truth, None where it holds none.
+    def read(cls, log: LogSource) -> GroundTruth | None:
+        """Read a log's ground truth; None where it holds none.
 
-        Raises WorldError where it does not describe a world, and LogReadError where the log is damaged.
+        Raises:
+            WorldError: The log's description of the world is not valid.
+            LogReadError: The log is damaged.
         """
         attachment = log.attachment("world.json")
         if attachment is None:
@@ -36,13 +43,13 @@ class Truth:
         topic = log.topics.get(TRUE_PRIMITIVES_TOPIC)
         if topic is None or topic.type != MARKERS_TYPE or not topic.messages:
             return cls(world, [])
-        moved = [
+        changes = [
             (stamp or log_time, replace(world, primitives=primitives))
             for log_time, (stamp, primitives) in log.decoded(topic, decode_primitives)
         ]
-        return cls(world, sorted(moved, key=lambda item: item[0]))
+        return cls(world, sorted(changes, key=lambda item: item[0]))
 
     def at(self, stamp: int) -> World:
-        """The world at ``stamp`` (ns)."""
+        """Return the world at ``stamp`` (ns)."""
         index = bisect.bisect_right(self._stamps, stamp) - 1
         return self._worlds[index] if index >= 0 else self.world

@@ -11,17 +11,45 @@ from mapping.mapper import check_mapper
 from prim.errors import UsageError
 from prim.se2 import Pose2D
 from prim.world import Bounds
-from replay.poses.fusion import PoseNoise
-from replay.poses.localize import FUSED, FuseOptions
+from replay.poses.fusion_options import FusionInputs, SensorNoise
+from replay.poses.laser_poses import FUSED
 from replay.selection import Selection
 
 MAX_OFFSET = 1000.0
-"""No laser stands further (m) from its robot's origin."""
+"""The largest plausible distance (m) of a laser from its robot's origin; set by hand."""
 
 
 @dataclass(frozen=True)
 class ReplayOptions:
-    """How one log is replayed; lengths in metres, times in seconds. Raises UsageError on impossible values."""
+    """How a log is replayed.
+
+    Attributes:
+        mapper: The mapper: «det», «prob» or «forward».
+        sensor_model: The inverse sensor model of «prob»: «eq4» or «gaussian».
+        noise_std: The range noise (m); None to estimate it where it is needed.
+        pose: The source of poses (:class:`prim.choices.PoseSourceName`).
+        resolution: Side of a cell (m).
+        bounds: Bounds of the map (m): x0, y0, x1, y1; None to choose them.
+        scan_topic: The topic of scans; None where the log has only one.
+        odom_topic: The topic of poses; None where the log has only one.
+        laser_offset: The laser's pose on the robot (m, rad); None where tf has it.
+        max_range: Ranges beyond this count as no return (m); None for the scanner's own range_max.
+        standing_still: The robot does not move: map without poses.
+        fuse: What poses are fused from.
+        deskew: Whether the laser's motion during a scan is compensated for.
+        match_scans: Whether poses are corrected by matching scans.
+        selection: Which scans are replayed.
+        rate: The replay is held to this multiple of the log's speed; None for no limit.
+        map_every: The map is shown every so many scans; None to choose the interval.
+        detect: Whether primitives are detected.
+        detect_every: Primitives are detected every so many scans as well as at the end; None for the end only.
+        refine: Whether detections are refined with the rays.
+        weights: The weights of the detector; None for those that come with prim.
+        recover: Whether what is left of a damaged log is read.
+
+    Raises:
+        UsageError: A value is impossible, or two exclude each other.
+    """
 
     mapper: str = "det"
     sensor_model: str = "eq4"
@@ -34,7 +62,7 @@ class ReplayOptions:
     laser_offset: Pose2D | None = None
     max_range: float | None = None
     standing_still: bool = False
-    fuse: FuseOptions = field(default_factory=FuseOptions)
+    fuse: FusionInputs = field(default_factory=FusionInputs)
     deskew: bool = True
     match_scans: bool = False
     selection: Selection = field(default_factory=Selection)
@@ -67,12 +95,12 @@ class ReplayOptions:
     def _check_poses(self) -> None:
         if self.standing_still and (self.pose != "auto" or self.odom_topic):
             raise UsageError("--standing-still excludes --pose and --odom-topic")
-        if self.standing_still and (self.match_scans or self.fuse != FuseOptions()):
+        if self.standing_still and (self.match_scans or self.fuse != FusionInputs()):
             raise UsageError("--standing-still excludes --match-scans and all that says how poses are fused")
         fuses = self.pose in ("auto", FUSED)
-        if not fuses and replace(self.fuse, noise=PoseNoise()) != FuseOptions():
+        if not fuses and replace(self.fuse, noise=SensorNoise()) != FusionInputs():
             raise UsageError(f"--fuse, --gps-topic and --compass-topic do not go with --pose {self.pose}")
-        if not fuses and not self.match_scans and self.fuse.noise != PoseNoise():
+        if not fuses and not self.match_scans and self.fuse.noise != SensorNoise():
             raise UsageError("--pose-noise and --odom-noise go with --pose fused or with --match-scans")
         if self.odom_topic and self.pose not in ("auto", "odom", FUSED):
             raise UsageError(f"--odom-topic goes with --pose odom, not with --pose {self.pose}")

@@ -1,98 +1,67 @@
-"""Replay: one log through one mapper, shown and scored as it goes."""
+"""Replay: a log through a mapper, scan by scan, evaluated and shown as it goes."""
 
 from __future__ import annotations
 
-import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
+from typing import NamedTuple
 
-import numpy as np
-
-from detect.networks.weights import shipped_weights
-from mapping.forward.mapper import find_noise
 from mapping.grid import GridFrame, OccupancyGrid
-from mapping.kernels import end_extent
 from mapping.map_metrics import MapScores
-from mapping.mapper import Mapper, make_mapper
-from prim.arrays import FloatArray
-from prim.errors import LogReadError, UsageError, WorldError
-from prim.log.mcap import LogReader
-from prim.scan import PosedScan, Scan, pieces_of, turned_over
-from prim.se2 import Pose2D
-from prim.world import World
-from replay.detection import Lookout, Sighting
-from replay.evaluation import Judge
-from replay.ground_truth import Truth
+from prim.choices import MapperName
+from prim.errors import LogReadError, WorldError
+from prim.log import open_log
+from prim.log.source import LogSource
+from prim.scan import PosedScan
+from replay.detection import DetectionResult, DetectionStage, NoDetection, make_detection_stage
+from replay.evaluation import ReplayEvaluator
+from replay.ground_truth import GroundTruth
+from replay.mapping_stage import MappingStage, choose_frame, make_replay_mapper
+from replay.notes import pluralize
 from replay.options import ReplayOptions
-from replay.posed_scans import ScanLog, counted
-from replay.poses.fusion import PoseNoise
-from replay.poses.localize import FUSED, FuseOptions, LaserPoses, Localizer
+from replay.posed_scans import PosedScanOptions, PosedScans, ScanLog
+from replay.poses.fusion_options import FusionInputs, SensorNoise
+from replay.poses.laser_poses import FUSED, LaserPoses
+from replay.poses.localize import Localizer
 from replay.result import ReplayResult
+from replay.timing import RatePacer, StageTimer
 from replay.viewer_protocol import NullViewer, Scene, Viewer
 
-WORLD_MARGIN = 0.1
-"""Automatic bounds reach this far (m) beyond the recorded world."""
+MAP_SNAPSHOTS = 50
+"""By default the map is shown about this many times; set by hand."""
 
-
-MAX_WAIT = 10.0
-"""A replay at a rate waits no longer (s) for the next scan, however long the log paused."""
-
-MAP_FRAMES = 50
-MAP_FRAME_CELLS = 40_000_000
-"""By default the map is shown about this often, and no more cells are shown in all."""
-
-NOISE_SCANS = 200
-"""The noise is found from about so many scans, evenly spread over the log, where only the noise is wanted."""
+MAP_SNAPSHOT_CELLS = 40_000_000
+"""By default no more cells than this are shown in all snapshots together: one byte each in a recording."""
 
 Progress = Callable[[int, int], None]
 
 
-@dataclass
-class Used:
-    """How much of a log went into the map."""
+class Outcome(NamedTuple):
+    """What a replay comes to.
 
-    scans: int = 0
-    rays: int = 0
-    hits: int = 0
+    Attributes:
+        grid: The map of all scans.
+        scores: Its scores; None without ground truth.
+        detections: The primitives in it; None where detection was skipped.
+    """
 
-    def count(self, scan: Scan) -> None:
-        """Adds a scan."""
-        self.scans += 1
-        self.rays += len(scan.ranges)
-        self.hits += int(np.count_nonzero(scan.hits))
-
-
-class Clock:
-    """Adds up the seconds spent in each stage; what is spent in a stage within another counts to the inner one."""
-
-    def __init__(self) -> None:
-        self.seconds: dict[str, float] = dict.fromkeys(("read", "localize", "map", "detect", "refine", "viewer"), 0.0)
-        self._start = time.perf_counter()
-        self._within: list[float] = []
-
-    @contextmanager
-    def stage(self, name: str) -> Iterator[None]:
-        """Counts the block's time to a stage."""
-        start = time.perf_counter()
-        self._within.append(0.0)
-        try:
-            yield
-        finally:
-            spent = time.perf_counter() - start
-            self.seconds[name] += spent - self._within.pop()
-            if self._within:
-                self._within[-1] += spent
-
-    def total(self) -> float:
-        """Seconds since the clock was made."""
-        return time.perf_counter() - self._start
+    grid: OccupancyGrid
+    scores: MapScores | None
+    detections: DetectionResult | None
 
 
 class Pipeline:
-    """Replays one log: survey, localize, map scan by scan, score, show."""
+    """Replays one log.
+
+    Args:
+        path: The log: a file, or a folder of a ROS 2 bag.
+        options: How it is replayed.
+        viewer: Shows the replay as it goes; None for no viewer.
+        progress: Called after each scan with the number of scans so far and in all.
+    """
 
     def __init__(
         self,
@@ -105,83 +74,71 @@ class Pipeline:
         self.options = options
         self.viewer: Viewer = viewer or NullViewer()
         self._progress = progress or (lambda done, total: None)
-        self._clock = Clock()
+        self._timer = StageTimer()
         self._notes: list[str] = []
-        self._blind: str | None = None
 
     def run(self) -> ReplayResult:
-        """The whole replay. Raises LogReadError, UsageError, OutputError."""
-        try:
-            return self._run()
-        except BaseException:
-            self.viewer.abandon()
-            raise
+        """Replay the log, from the file to the result.
 
-    def _run(self) -> ReplayResult:
-        with LogReader(self.path, recover=self.options.recover) as log:
-            with self._clock.stage("read"):
-                scans = ScanLog(log, self.options.scan_topic, self.options.selection)
-                truth = self._read_truth(log)
-            with self._clock.stage("localize"):
-                poses, true_poses = self._localize(log, scans)
-                if self.options.match_scans:
-                    poses = self._matched(scans, poses)
-            frame = self._frame(scans, poses, truth)
-            judge = Judge(frame, truth, poses, true_poses)
-            lookout = self._lookout(frame, truth if judge.scores_maps else None, poses.frame_covariance)
-            mapper = self._mapper(scans, poses, frame)
-            scene = Scene(
-                log.path.name,
-                self.options.mapper,
-                frame.bounds,
-                judge.scores_maps,
-                judge.compares_poses,
-                has_evidence=self.options.mapper == "forward",
-                has_detections=lookout is not None,
-                has_errors=lookout is not None and judge.scores_maps,
-            )
-            self._begin(log, scans, poses, scene)
-            used = self._map_scans(scans, poses, mapper, judge, truth, lookout, self._map_every(len(scans), frame))
-            with self._clock.stage("map"):
-                grid = mapper.finish()
-            scores = judge.score(grid)
-            last = len(scans) - 1
-            stamp = int(scans.stamps[last])
-            sighting = None
-            if lookout is not None:
-                with self._clock.stage("detect"):
-                    seen = lookout.last_map(grid)
-                posed = (piece for posed in self._posed(scans, poses) for piece in posed.pieces)
-                sighting = self._sighting(lookout, seen, stamp, posed)
-            self._note_what_was_used(scans, poses, used, grid)
-            result = self._result(log, scans, poses, used, grid, mapper.noise_std, scores, sighting, judge)
-            with self._clock.stage("viewer"):
-                if sighting is not None:
-                    self.viewer.show_sighting(last, stamp, sighting)
-                for note in result.notes:
-                    self.viewer.event(last, stamp, note, warning=True)
-                self.viewer.show_map(last, stamp, grid, scores)
-                self.viewer.finish(result)
+        Raises:
+            LogReadError: The log cannot be read, or lacks what the replay needs.
+            UsageError: The options do not fit together or do not fit the log.
+            OutputError: The recording cannot be written.
+        """
+        with self._abandoned_on_failure(), open_log(self.path, recover=self.options.recover) as log:
+            scans = self._read_scans(log)
+            truth = self._read_truth(log)
+            poses, true_poses = self._localize(log, scans)
+            posed_scans = self._posed_scans(scans, poses)
+            frame = choose_frame(posed_scans, self.options, truth.world if truth else None)
+            evaluator = ReplayEvaluator(frame, truth, poses, true_poses)
+            detection = self._make_detection_stage(frame, evaluator, poses)
+            mapping = self._make_mapping_stage(frame, posed_scans, detection)
+            self._begin_viewer(frame, posed_scans, detection, evaluator)
+            for posed in self._paced(posed_scans):
+                seconds = mapping.update(posed)
+                evaluator.update(posed)
+                self._show_detections(posed, detection.update(posed, mapping.mapper))
+                self._show_scan(posed, seconds, evaluator)
+                self._show_map(posed, mapping.snapshot(posed.position), evaluator)
+            grid = mapping.finish()
+            outcome = Outcome(grid, evaluator.score(grid), detection.finish(grid, posed_scans))
+            result = self._result(log, posed_scans, mapping, detection, evaluator, outcome)
+            self._show_result(result)
         return result
 
-    def _read_truth(self, log: LogReader) -> Truth | None:
-        """The log's true world; a note where it has one that cannot be understood."""
-        try:
-            return Truth.read(log)
-        except WorldError as error:
-            self._notes.append(f"the map is not scored: {error}")
-            return None
+    def _read_scans(self, log: LogSource) -> ScanLog:
+        """Find the scans that are to be replayed."""
+        with self._timer.stage("read"):
+            return ScanLog(log, self.options.scan_topic, self.options.selection)
 
-    def _localize(self, log: LogReader, scans: ScanLog) -> tuple[LaserPoses, LaserPoses | None]:
-        """The laser's poses, and the true ones where the log has them."""
+    def _read_truth(self, log: LogSource) -> GroundTruth | None:
+        """Read the log's true world; note where it has one that is not valid."""
+        with self._timer.stage("read"):
+            try:
+                return GroundTruth.read(log)
+            except WorldError as error:
+                self._notes.append(f"the map is not scored: {error}")
+                return None
+
+    def _localize(self, log: LogSource, scans: ScanLog) -> tuple[LaserPoses, LaserPoses | None]:
+        """Estimate the laser's pose at every scan; return the true ones beside it where the log has them."""
+        with self._timer.stage("localize"):
+            poses, true_poses = self._locate(log, scans)
+            if self.options.match_scans:
+                poses = self._match_scans(scans, poses)
+        return poses, true_poses
+
+    def _locate(self, log: LogSource, scans: ScanLog) -> tuple[LaserPoses, LaserPoses | None]:
+        """Read the laser's poses from the source that is asked for, and the true ones."""
         options = self.options
         localizer = Localizer(log, options.odom_topic, options.laser_offset, options.fuse)
         times = scans.times if options.deskew else replace(scans.times, sweep=0)
         if options.standing_still:
             return localizer.stand_still(times), None
         poses = localizer.locate(times, options.pose)
-        told = replace(options.fuse, noise=PoseNoise()) if options.match_scans else options.fuse
-        if told != FuseOptions() and poses.source != FUSED:
+        fuse = replace(options.fuse, noise=SensorNoise()) if options.match_scans else options.fuse
+        if fuse != FusionInputs() and poses.source != FUSED:
             self._notes.append(f"nothing is fused, since there are poses on {poses.origin}: give --pose fused")
         if poses.source == "truth":
             return poses, poses
@@ -193,269 +150,158 @@ class Pipeline:
             self._notes.append(f"the poses are not held against the truth: {error.what}")
             return poses, None
 
-    def _matched(self, scans: ScanLog, poses: LaserPoses) -> LaserPoses:
-        """The poses corrected by a map that is made of the scans."""
-        from replay.poses.scan_matching import match  # when it is needed: a replay without it starts faster
+    def _match_scans(self, scans: ScanLog, poses: LaserPoses) -> LaserPoses:
+        """Correct the poses by matching every scan with the map of the others."""
+        from replay.poses.scan_matching import match_scans  # when it is needed: a replay without it starts faster
 
         options = self.options
-        posed = partial(self._posed, scans)
-        return match(
+        posed = partial(self._posed_scans, scans)
+        return match_scans(
             poses, scans.stamps, posed, options.resolution, options.noise_std, options.fuse.noise, options.bounds
         )
 
-    def _frame(self, scans: ScanLog, poses: LaserPoses, truth: Truth | None) -> GridFrame:
-        """The map's frame: the bounds given, else the recorded world's and a margin, else the end points'."""
-        bounds = self.options.bounds
-        if bounds is None and truth is not None:
-            x0, y0, x1, y1 = truth.world.bounds
-            m = WORLD_MARGIN
-            bounds = x0 - m, y0 - m, x1 + m, y1 + m
-        if bounds is not None:
-            return GridFrame.covering(bounds, self.options.resolution)
-        extents = [
-            end_extent(
-                scan.ranges,
-                scan.directions,
-                (pose.x, pose.y, np.cos(pose.theta), np.sin(pose.theta)),
-                (scan.range_min, scan.range_max),
-                1 / self.options.resolution,
-            )
-            for posed in self._posed(scans, poses)
-            for scan, pose in posed.pieces
-        ]
-        if not extents:
-            raise LogReadError(self.path, "no scan that can be used has a pose", "give another --pose")
-        row, col = np.min([extent[:2] for extent in extents], axis=0).tolist()
-        last_row, last_col = np.max([extent[2:] for extent in extents], axis=0).tolist()
-        return GridFrame(self.options.resolution, row, col, last_row - row + 1, last_col - col + 1)
+    def _posed_scans(self, scans: ScanLog, poses: LaserPoses) -> PosedScans:
+        """Give the scans their poses, and cut them where the laser moved by half a cell."""
+        options = PosedScanOptions(self.options.resolution / 2, self.options.max_range)
+        return PosedScans(scans, poses, options, self._timer)
 
-    def _mapper(self, scans: ScanLog, poses: LaserPoses, frame: GridFrame) -> Mapper:
-        """The mapper; where it needs the noise and nobody gave it, the forward model finds it first."""
-        options = self.options
-        noise_std = options.noise_std
-        if options.sensor_model == "gaussian" and noise_std is None:
-            every = -(-len(scans) // NOISE_SCANS)
-            chosen = (posed for posed in self._posed(scans, poses) if posed.position % every == 0)
-            some = [piece for posed in chosen for piece in posed.pieces]
-            with self._clock.stage("map"):
-                noise_std = find_noise(some, frame)
-            if noise_std is None:
-                raise LogReadError(
-                    self.path,
-                    "too few ranges to find the noise for the Gaussian sensor model",
-                    "give it: --noise-std",
-                )
-        return make_mapper(options.mapper, options.resolution, frame.bounds, options.sensor_model, noise_std)
+    def _make_detection_stage(
+        self, frame: GridFrame, evaluator: ReplayEvaluator, poses: LaserPoses
+    ) -> DetectionStage | NoDetection:
+        """Make the stage that detects primitives, in the map so far and in the final one."""
+        truth = evaluator.comparable_truth
+        return make_detection_stage(self.options, frame, truth, poses.frame_covariance, self._timer)
 
-    def _lookout(self, frame: GridFrame, truth: Truth | None, spread: FloatArray | None) -> Lookout | None:
-        """What looks for primitives; None, and the reason kept, where it cannot and nobody asked for it by name."""
-        options = self.options
-        if not options.detect:
-            return None
-        asked = options.weights is not None or options.detect_every is not None
-        weights = options.weights or shipped_weights(options.mapper)
-        try:
-            if weights is None:
-                raise UsageError(f"no weights for maps of {options.mapper} come with prim: give --weights")
-            return self._loaded(weights, frame, truth, spread)
-        except UsageError as error:
-            if asked:
-                raise
-            self._blind = str(error)
-            return None
+    def _make_mapping_stage(
+        self, frame: GridFrame, posed_scans: PosedScans, detection: DetectionStage | NoDetection
+    ) -> MappingStage:
+        """Make the stage that maps scan by scan; note where the map is too large to be shown often."""
+        interval, notes = self._snapshot_interval(frame, len(posed_scans.scan_log))
+        self._notes += notes
+        mapper = make_replay_mapper(posed_scans, frame, self.options, self._timer)
+        return MappingStage(mapper, interval, interval is not None or detection.streaming, self._timer)
 
-    def _loaded(self, weights: Path, frame: GridFrame, truth: Truth | None, spread: FloatArray | None) -> Lookout:
-        """The detector, with a map of its own where it reads other maps than the one that is made."""
-        from detect.detector import Detector  # when it is needed: a replay without detection starts faster
-
-        options = self.options
-        with self._clock.stage("detect"):
-            detector = Detector.load(weights, options.mapper)
-        tracker = None
-        if options.detect_every is not None:
-            from detect.tracker import Tracker
-
-            tracker = Tracker()
-        cell = detector.card.resolution
-        if np.isclose(options.resolution, cell, rtol=1e-6) and options.sensor_model == "eq4":
-            return Lookout(detector, None, truth, tracker, options.refine, options.noise_std, spread)
-        noise_std = options.noise_std if options.mapper == "forward" else None
-        own = make_mapper(options.mapper, cell, GridFrame.covering(frame.bounds, cell).bounds, "eq4", noise_std)
-        return Lookout(detector, own, truth, tracker, options.refine, options.noise_std, spread)
-
-    def _posed(self, scans: ScanLog, poses: LaserPoses) -> Iterator[PosedScan]:
-        """The scans that have a pose, as seen from above."""
-        source = iter(scans)
-        while True:
-            with self._clock.stage("read"):
-                item = next(source, None)
-            if item is None:
-                return
-            position, scan = item
-            if poses.valid[position]:
-                seen = self._prepared(scan, poses.upside_down)
-                pose, end = poses.at(position), poses.end(position)
-                yield PosedScan(position, seen, pose, pieces_of(seen, pose, end, self.options.resolution / 2))
-
-    def _prepared(self, scan: Scan, upside_down: bool) -> Scan:
-        """The scan as seen from above, and no further than the largest range in use."""
-        if self.options.max_range is not None and scan.range_max > self.options.max_range:
-            scan = replace(scan, range_max=self.options.max_range)
-        return turned_over(scan) if upside_down else scan
-
-    def _map_every(self, scans: int, frame: GridFrame) -> int | None:
-        """Every how many scans the map is shown: as asked, else so that the recording stays small."""
+    def _snapshot_interval(self, frame: GridFrame, scans: int) -> tuple[int | None, list[str]]:
+        """Choose every how many scans the map is shown, so that a recording stays small; and what to note of that."""
         if not self.viewer.shows:
-            return None
-        shown = min(MAP_FRAMES, max(1, MAP_FRAME_CELLS // (frame.rows * frame.cols)))
-        if shown < min(MAP_FRAMES, scans) and not self.options.map_every:
-            self._notes.append(
-                f"the map is large and shown {counted(shown, 'time')} along the way: more often with --map-every, "
-                "or with a coarser --resolution"
-            )
-        return self.options.map_every or max(1, -(-scans // shown))
+            return None, []
+        if self.options.map_every:
+            return self.options.map_every, []
+        snapshots = min(MAP_SNAPSHOTS, max(1, MAP_SNAPSHOT_CELLS // (frame.rows * frame.cols)))
+        note = (
+            f"the map is large and shown {pluralize(snapshots, 'time')} along the way: more often with --map-every, "
+            "or with a coarser --resolution"
+        )
+        return max(1, -(-scans // snapshots)), [note] if snapshots < min(MAP_SNAPSHOTS, scans) else []
 
-    def _begin(self, log: LogReader, scans: ScanLog, poses: LaserPoses, scene: Scene) -> None:
-        with self._clock.stage("viewer"):
+    def _paced(self, posed_scans: PosedScans) -> Iterator[PosedScan]:
+        """Iterate over the scans, no faster than at the rate that is asked for, and report the progress."""
+        pacer = RatePacer(self.options.rate)
+        for posed in posed_scans:
+            pacer.wait(posed.scan.stamp)
+            yield posed
+            self._progress(posed.position + 1, len(posed_scans.scan_log))
+
+    def _begin_viewer(
+        self,
+        frame: GridFrame,
+        posed_scans: PosedScans,
+        detection: DetectionStage | NoDetection,
+        evaluator: ReplayEvaluator,
+    ) -> None:
+        """Describe the replay to the viewer before the first scan."""
+        scans, poses = posed_scans.scan_log, posed_scans.poses
+        detects = isinstance(detection, DetectionStage)
+        scene = Scene(
+            log=scans.path.name,
+            mapper=self.options.mapper,
+            bounds=frame.bounds,
+            has_scores=evaluator.scores_maps,
+            has_pose_errors=evaluator.compares_poses,
+            has_evidence=self.options.mapper == MapperName.FORWARD,
+            has_detections=detects,
+            has_errors=detects and evaluator.scores_maps,
+        )
+        first = int(scans.stamps[0])
+        with self._timer.stage("viewer"):
             self.viewer.begin(scene)
-            first = int(scans.stamps[0])
             self.viewer.event(0, first, f"{len(scans)} of {scans.total} scans selected on {scans.topic.name}")
             self.viewer.event(0, first, f"poses: {poses.source} ({poses.origin})")
 
-    def _note_what_was_used(self, scans: ScanLog, poses: LaserPoses, used: Used, grid: OccupancyGrid) -> None:
-        """What a user should know about scans that were left out, and about rays that met nothing."""
-        self._notes += [*poses.notes, *scans.notes()]
-        outside = int(np.count_nonzero(~poses.valid))
-        if outside:
-            self._notes.append(f"{counted(outside, 'scan')} outside the time of the poses: not used")
-        if not used.hits:
-            self._notes.append(f"none of {used.rays} rays returned from a surface: nothing is occupied")
-        elif not (grid.free | grid.occupied).any():
-            self._notes.append("no ray crosses the map's bounds: all of it is unknown")
+    def _show_detections(self, posed: PosedScan, detections: DetectionResult | None) -> None:
+        """Show the primitives detected after a scan, where there was a detection."""
+        if detections is not None:
+            with self._timer.stage("viewer"):
+                self.viewer.show_detections(posed.position, posed.scan.stamp, detections)
 
-    def _map_scans(
-        self,
-        scans: ScanLog,
-        poses: LaserPoses,
-        mapper: Mapper,
-        judge: Judge,
-        truth: Truth | None,
-        lookout: Lookout | None,
-        map_every: int | None,
-    ) -> Used:
-        """Maps, scores and shows scan by scan; returns what was used."""
-        used = Used()
-        shown: World | None = None
-        pace = Pace(self.options.rate)
-        every = self.options.detect_every if lookout else None
-        add = mapper.update if map_every or every else mapper.keep
-        for posed in self._posed(scans, poses):
-            position, scan = posed.position, posed.scan
-            stamp = int(scans.stamps[position])
-            pace.wait(stamp)
-            start = time.perf_counter()
-            with self._clock.stage("map"):
-                for piece, pose in posed.pieces:
-                    add(piece, pose)
-            seconds = time.perf_counter() - start
-            judge.update(position, scan, stamp)
-            used.count(scan)
-            if lookout is not None:
-                self._look(lookout, mapper, posed, stamp)
-            with self._clock.stage("viewer"):
-                if truth is not None and truth.at(stamp) is not shown:
-                    shown = truth.at(stamp)
-                    self.viewer.show_truth(position, stamp, shown)
-                self.viewer.show_scan(position, stamp, posed.pose, posed.points, seconds)
-                error = judge.pose_error(position)
-                if error is not None:
-                    self.viewer.show_pose_error(position, stamp, *error, posed.pose)
-            if map_every and position % map_every == 0:
-                with self._clock.stage("map"):
-                    grid = mapper.grid()
-                scores = judge.score(grid)
-                with self._clock.stage("viewer"):
-                    self.viewer.show_map(position, stamp, grid, scores)
-            self._progress(position + 1, len(scans))
-        return used
+    def _show_scan(self, posed: PosedScan, seconds: float, evaluator: ReplayEvaluator) -> None:
+        """Show the true world, a scan, the time it took to map (s), and its pose error."""
+        with self._timer.stage("viewer"):
+            world = evaluator.world(posed.scan.stamp)
+            if world is not None:
+                self.viewer.show_truth(posed.position, posed.scan.stamp, world)
+            self.viewer.show_scan(posed, seconds)
+            error = evaluator.pose_error(posed.position)
+            if error is not None:
+                self.viewer.show_pose_error(posed, *error)
 
-    def _look(self, lookout: Lookout, mapper: Mapper, posed: PosedScan, stamp: int) -> None:
-        """Shows the detector a scan and, where it is time, lets it look."""
-        every = self.options.detect_every
-        with self._clock.stage("detect"):
-            for scan, pose in posed.pieces:
-                (lookout.update if every else lookout.keep)(scan, pose)
-            if not every or (posed.position + 1) % every:
-                return
-            seen = lookout.map_so_far(mapper)
-        sighting = self._sighting(lookout, seen, stamp)
-        with self._clock.stage("viewer"):
-            self.viewer.show_sighting(posed.position, stamp, sighting)
-
-    def _sighting(
-        self, lookout: Lookout, seen: OccupancyGrid, stamp: int, posed: Iterable[tuple[Scan, Pose2D]] | None = None
-    ) -> Sighting:
-        """Primitives in a map: detected, refined by the scans ``posed`` (or those so far), tracked."""
-        noise_std = None
-        with self._clock.stage("detect"):
-            detections = lookout.detect(seen)
-        if lookout.refines:
-            with self._clock.stage("refine"):
-                detections, noise_std = lookout.refine(detections, seen, posed)
-        with self._clock.stage("detect"):
-            return lookout.sighting(detections, stamp, noise_std)
+    def _show_map(self, posed: PosedScan, grid: OccupancyGrid | None, evaluator: ReplayEvaluator) -> None:
+        """Show a snapshot of the map, where there is one, and its scores."""
+        if grid is not None:
+            scores = evaluator.score(grid)
+            with self._timer.stage("viewer"):
+                self.viewer.show_map(posed.position, posed.scan.stamp, grid, scores)
 
     def _result(
         self,
-        log: LogReader,
-        scans: ScanLog,
-        poses: LaserPoses,
-        used: Used,
-        grid: OccupancyGrid,
-        noise_std: float | None,
-        scores: MapScores | None,
-        sighting: Sighting | None,
-        judge: Judge,
+        log: LogSource,
+        posed_scans: PosedScans,
+        mapping: MappingStage,
+        detection: DetectionStage | NoDetection,
+        evaluator: ReplayEvaluator,
+        outcome: Outcome,
     ) -> ReplayResult:
+        """Collect what the stages found out."""
+        scans = posed_scans.scan_log
+        self._notes += [*posed_scans.notes(), *mapping.notes(outcome.grid)]
         return ReplayResult(
             path=self.path,
             options=self.options,
             duration=scans.duration,
             scans=scans.total,
-            scans_used=used.scans,
-            rays=used.rays,
+            scans_used=mapping.usage.scans,
+            rays=mapping.usage.rays,
             lost=tuple(log.lost),
             notes=(*(f"lost: {lost}" for lost in log.lost), *self._notes),
             messages_lost=log.messages_lost,
-            poses=poses,
+            poses=posed_scans.poses,
             stamps=scans.stamps,
-            pose_rmse=judge.pose_rmse(),
-            pose_nees=judge.pose_nees(),
-            grid=grid,
-            noise_std=noise_std,
-            scores=scores,
-            sighting=sighting,
-            blind=self._blind,
-            seconds=self._clock.seconds | {"total": self._clock.total()},
+            pose_rmse=evaluator.pose_rmse(),
+            pose_nees=evaluator.pose_nees(),
+            grid=outcome.grid,
+            noise_std=mapping.mapper.noise_std,
+            scores=outcome.scores,
+            detections=outcome.detections,
+            detection_skipped=detection.skipped,
+            seconds=self._timer.seconds | {"total": self._timer.total()},
         )
 
+    def _show_result(self, result: ReplayResult) -> None:
+        """Show the final map and detections, the notes and the summary, and close the viewer."""
+        position, stamp = len(result.stamps) - 1, int(result.stamps[-1])
+        with self._timer.stage("viewer"):
+            if result.detections is not None:
+                self.viewer.show_detections(position, stamp, result.detections)
+            for note in result.notes:
+                self.viewer.event(position, stamp, note, warning=True)
+            self.viewer.show_map(position, stamp, result.grid, result.scores)
+            self.viewer.finish(result)
 
-class Pace:
-    """Holds a replay to ``rate`` times the log's own speed; None does not hold it."""
-
-    def __init__(self, rate: float | None) -> None:
-        self._rate = rate
-        self._start: tuple[float, int] | None = None
-
-    def wait(self, stamp: int) -> None:
-        """Sleeps until ``stamp`` (ns) is due."""
-        if self._rate is None:
-            return
-        if self._start is None:
-            self._start = time.perf_counter(), stamp
-        began, first = self._start
-        ahead = (stamp - first) / 1e9 / self._rate - (time.perf_counter() - began)
-        if ahead > MAX_WAIT:  # go on from here, or every scan after the pause would wait as well
-            self._start = time.perf_counter() + MAX_WAIT, stamp
-        if ahead > 0:
-            time.sleep(min(ahead, MAX_WAIT))
+    @contextmanager
+    def _abandoned_on_failure(self) -> Iterator[None]:
+        """Discard what the viewer has so far where the replay fails."""
+        try:
+            yield
+        except BaseException:
+            self.viewer.abandon()
+            raise

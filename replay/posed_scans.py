@@ -1,71 +1,98 @@
-"""Which scans of a log are replayed: the topic, the time, the stride."""
+"""The scans of a log that are replayed: which ones, and with the laser's poses."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from prim.arrays import Stamps
 from prim.errors import LogReadError
-from prim.log.mcap import LogReader
 from prim.log.messages import SCAN_TYPE, decode_scan, decode_stamp
-from prim.log.source import Topic
-from prim.scan import Scan
-from replay.poses.scan_times import ScanTimes
+from prim.log.source import LogSource, Topic
+from prim.scan import PosedScan, Scan, deskew, mirror_scan
+from replay.notes import pluralize
+from replay.poses.laser_poses import LaserPoses, ScanTimes
 from replay.selection import Selection
+from replay.timing import StageTimer
 
-LONGEST_SWEEP, OVERLAP = 1.0, 1.5
-"""A laser's turn takes no longer (s); nor so many times the time from one scan to the next, where there are two."""
+MAX_SWEEP = 1.0
+"""The longest plausible sweep (s) in a log of one scan; set by hand."""
+
+MAX_SWEEP_SHARE = 1.5
+"""The longest plausible sweep, as a multiple of the median time from one scan to the next; set by hand."""
 
 
 class ScanLog:
-    """The scans of one topic of a log. Raises LogReadError where there is none, or more than one to choose from."""
+    """The selected scans of one topic of a log, streamed.
 
-    def __init__(self, log: LogReader, topic: str | None, selection: Selection) -> None:
+    Args:
+        log: The log.
+        topic: The topic of scans; None where the log has only one.
+        selection: Which of the topic's scans are wanted.
+
+    Attributes:
+        topic: The topic in use.
+        total: The number of scans on the topic whose header can be read.
+        stamps: Stamps (N,) of the selected scans (ns).
+        first: The first usable scan of the selection.
+        unusable: The scans met so far that cannot be used: index on the topic and reason.
+
+    Raises:
+        LogReadError: There is no topic of scans, more than one to choose from, or no usable scan in the selection.
+    """
+
+    def __init__(self, log: LogSource, topic: str | None, selection: Selection) -> None:
         self._log = log
         self.topic = _scan_topic(log, topic)
         self.unusable: dict[int, str] = {}
         decodable, stamps = self._read_stamps()
         self.total = len(stamps)
         gaps = np.diff(np.unique(stamps))
-        self._longest_sweep = OVERLAP * float(np.median(gaps)) / 1e9 if len(gaps) else LONGEST_SWEEP
-        picked = selection.pick(stamps) if self.total else np.zeros(0, dtype=np.intp)
-        if not len(picked):
+        self._max_sweep = MAX_SWEEP_SHARE * float(np.median(gaps)) / 1e9 if len(gaps) else MAX_SWEEP
+        selected = selection.select(stamps) if self.total else np.zeros(0, dtype=np.intp)
+        if not len(selected):
             span = f"{(stamps.max() - stamps.min()) / 1e9:.1f} s" if self.total else "none"
             what = f"no scan is selected of the {self.total} on {self.topic.name} ({span} in all)"
             raise LogReadError(log.path, what, "give another --start, --end or --duration")
-        self.indices = decodable[picked]
-        self.stamps = stamps[picked]
+        self._indices = decodable[selected]
+        self.stamps = stamps[selected]
         self.first = next((scan for _, scan in self), None) or self._none_usable()
 
     @property
+    def path(self) -> Path:
+        """The log's path."""
+        return self._log.path
+
+    @property
     def times(self) -> ScanTimes:
-        """When the selected scans were taken, and in which frame."""
+        """The times of the selected scans, and the frame that they are given in."""
         return ScanTimes(self.stamps, self.first.frame_id, self.sweep)
 
     @property
     def sweep(self) -> int:
-        """The time (ns) from a scan's first beam to its last; 0 where the log does not say, or nothing sensible."""
-        return round(self._told_sweep * 1e9) if 0 < self._told_sweep <= self._longest_sweep else 0
+        """The time (ns) from a scan's first beam to its last; 0 where it is not given or not plausible."""
+        return round(self._given_sweep * 1e9) if 0 < self._given_sweep <= self._max_sweep else 0
 
     @property
-    def _told_sweep(self) -> float:
-        """The time (s) from a scan's first beam to its last, as the first scan has it."""
+    def _given_sweep(self) -> float:
+        """The time (s) from a scan's first beam to its last by the first scan's time_increment."""
         return self.first.time_increment * (len(self.first.ranges) - 1)
 
     @property
     def duration(self) -> float:
-        """Seconds from the first selected scan to the last."""
+        """The time from the earliest selected scan to the latest (s)."""
         return float(self.stamps.max() - self.stamps.min()) / 1e9
 
     def __len__(self) -> int:
-        return len(self.indices)
+        return len(self._indices)
 
     def __iter__(self) -> Iterator[tuple[int, Scan]]:
-        """(position among the selected, scan), streamed from the log; unusable scans are left out."""
-        positions = {index: position for position, index in enumerate(self.indices.tolist())}
+        """Iterate over (position in the selection, scan), read from the log; unusable scans are left out."""
+        positions = {index: position for position, index in enumerate(self._indices.tolist())}
         for index, _, scan in self._log.numbered(self.topic, decode_scan, wanted=positions):
             if scan.problem:
                 self.unusable[index] = scan.problem
@@ -73,31 +100,31 @@ class ScanLog:
                 yield positions[index], scan
 
     def notes(self) -> list[str]:
-        """What a user should know of scans that were left out or have odd stamps."""
+        """Return what a user should know of scans that were left out, not deskewed, or have irregular stamps."""
         notes = []
-        if self._told_sweep and not self.sweep:
+        if self._given_sweep and not self.sweep:
             notes.append(
-                f"scans are not deskewed: by their time_increment a sweep takes {self._told_sweep:.3g} s, where the "
-                f"time from one scan to the next allows {self._longest_sweep:.3g} s"
+                f"scans are not deskewed: by their time_increment a sweep takes {self._given_sweep:.3g} s, where the "
+                f"time from one scan to the next allows {self._max_sweep:.3g} s"
             )
-        return notes + self._oddities()
+        return notes + self._irregularities()
 
-    def _oddities(self) -> list[str]:
-        """Scans that were left out or have odd stamps."""
+    def _irregularities(self) -> list[str]:
+        """Describe scans that were left out or have irregular stamps."""
         notes = []
         if self.unusable:
             index, problem = min(self.unusable.items())
-            notes.append(f"{counted(len(self.unusable), 'scan')} cannot be used, the first one {index}: {problem}")
+            notes.append(f"{pluralize(len(self.unusable), 'scan')} cannot be used, the first one {index}: {problem}")
         steps = np.diff(self.stamps)
         if (steps < 0).any():
-            back = counted(int(np.count_nonzero(steps < 0)), "time")
+            back = pluralize(int(np.count_nonzero(steps < 0)), "time")
             notes.append(f"stamps go back {back}: scans are mapped in the order in which they were logged")
         if (steps == 0).any():
-            notes.append(f"{counted(int(np.count_nonzero(steps == 0)), 'scan')} with the stamp of the one before")
+            notes.append(f"{pluralize(int(np.count_nonzero(steps == 0)), 'scan')} with the stamp of the one before")
         return notes
 
     def _read_stamps(self) -> tuple[NDArray[np.intp], Stamps]:
-        """Indices and stamps of the scans whose header can be read."""
+        """Read the indices and stamps (ns) of the scans whose header can be read."""
         indices, stamps = [], []
         for index, _, stamp in self._log.numbered(self.topic, decode_stamp):
             indices.append(index)
@@ -105,16 +132,78 @@ class ScanLog:
         return np.array(indices, dtype=np.intp), np.array(stamps, dtype=np.int64)
 
     def _none_usable(self) -> Scan:
-        reasons = "; ".join([*self._oddities(), *self._log.lost])
+        reasons = "; ".join([*self._irregularities(), *self._log.lost])
         raise LogReadError(self._log.path, f"no scan on {self.topic.name} can be used: {reasons}")
 
 
-def counted(count: int, what: str) -> str:
-    """1 scan, 2 scans."""
-    return f"{count} {what}{'' if count == 1 else 's'}"
+@dataclass(frozen=True)
+class PosedScanOptions:
+    """How scans are prepared for mapping.
+
+    Attributes:
+        deskew_tolerance: A scan is cut so that the laser's motion displaces a measured point within one piece by no
+            more than this (m); the default is half a cell of the default resolution.
+        max_range: Ranges beyond this count as no return (m); None for the scanner's own range_max.
+    """
+
+    deskew_tolerance: float = 0.005
+    max_range: float | None = None
 
 
-def _scan_topic(log: LogReader, wanted: str | None) -> Topic:
+DEFAULT_OPTIONS = PosedScanOptions()
+
+
+class PosedScans:
+    """The scans of a log that have a pose, ready to be mapped; may be iterated over any number of times.
+
+    Scans of a laser that is mounted upside down are mirrored, and all are cut into pieces that have a pose of their
+    own where the laser moves during a sweep.
+
+    Args:
+        scan_log: The scans.
+        poses: The laser's poses at these scans.
+        options: How the scans are prepared.
+        timer: Counts the time of reading towards the stage «read».
+    """
+
+    def __init__(
+        self,
+        scan_log: ScanLog,
+        poses: LaserPoses,
+        options: PosedScanOptions = DEFAULT_OPTIONS,
+        timer: StageTimer | None = None,
+    ) -> None:
+        self.scan_log = scan_log
+        self.poses = poses
+        self._options = options
+        self._timer = timer or StageTimer()
+
+    def __iter__(self) -> Iterator[PosedScan]:
+        """Iterate over the scans that have a pose, in the order of the log."""
+        for position, scan in self._timer.iterate("read", self.scan_log):
+            if self.poses.valid[position]:
+                prepared = self._prepared(scan)
+                pose, end = self.poses.at(position), self.poses.end_at(position)
+                pieces = deskew(prepared, pose, end, self._options.deskew_tolerance)
+                yield PosedScan(position, prepared, pose, pieces)
+
+    def notes(self) -> list[str]:
+        """Return what a user should know of the poses and of scans that were left out."""
+        notes = [*self.poses.notes, *self.scan_log.notes()]
+        outside = int(np.count_nonzero(~self.poses.valid))
+        if outside:
+            notes.append(f"{pluralize(outside, 'scan')} outside the time of the poses: not used")
+        return notes
+
+    def _prepared(self, scan: Scan) -> Scan:
+        """Limit a scan's range, and mirror it where the laser is mounted upside down."""
+        max_range = self._options.max_range
+        if max_range is not None and scan.range_max > max_range:
+            scan = replace(scan, range_max=max_range)
+        return mirror_scan(scan) if self.poses.upside_down else scan
+
+
+def _scan_topic(log: LogSource, wanted: str | None) -> Topic:
     topics = log.of_type(SCAN_TYPE)
     names = ", ".join(topic.name for topic in topics)
     if wanted is not None:
@@ -135,7 +224,7 @@ def _scan_topic(log: LogReader, wanted: str | None) -> Topic:
     return topics[0]
 
 
-def _listing(log: LogReader) -> str:
+def _listing(log: LogSource) -> str:
     topics = sorted(log.topics.values(), key=lambda topic: topic.name)
     listed = ", ".join(f"{topic.name} ({topic.type or topic.encoding})" for topic in topics)
     return f"its topics: {listed}" if listed else "it has no topics at all"

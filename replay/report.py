@@ -1,34 +1,36 @@
-"""What a replay leaves behind: the JSON report, the nav2 map, the trajectory, the table."""
+"""The result of a replay for machines (the JSON report) and for people (the table)."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 import numpy as np
 
 from mapping.grid import OccupancyGrid
+from mapping.map_metrics import MapScores
 from prim.metrics import DetectionErrors
 from prim.shapes import Kind
-from replay.detection import Sighting
-from replay.posed_scans import counted
-from replay.poses.localize import COMPASS, GPS, ODOM, LaserPoses, Sensor
+from replay.detection import DetectionResult
+from replay.notes import pluralize
+from replay.poses.fusion_options import COMPASS, GPS, ODOM
+from replay.poses.laser_poses import FusedSensor, LaserPoses
 from replay.result import ReplayResult
 
 UNITS = {ODOM: ("m", "rad"), GPS: ("m",), COMPASS: ("rad",)}
-"""What the noise of each sensor is told in."""
+"""The units of each sensor's noise."""
 
 SCHEMA = "prim-replay/1"
 
-LEAST_RAY_NOISE = 0.002
-"""Refinement tells no smaller noise (m)."""
+MIN_RAY_NOISE = 0.002
+"""The smallest range noise (m) that refinement estimates: its lower bound."""
 
-CELLS_LIMIT = 1.5
-"""Noise below this many cells cannot be told from the cells' own size."""
+MIN_NOISE_CELLS = 1.5
+"""Range noise below this many cells cannot be distinguished from the size of the cells; set by hand."""
 
 
-def report(result: ReplayResult) -> dict[str, Any]:
-    """The report as DESIGN section 7 has it (schema ``prim-replay/1``)."""
+def report_json(result: ReplayResult) -> dict[str, Any]:
+    """Return the report of a replay as JSON values (schema ``prim-replay/1``, docs/formats.md)."""
     frame = result.grid.frame
     seconds = result.seconds
     rmse = result.pose_rmse or (None, None)
@@ -43,7 +45,7 @@ def report(result: ReplayResult) -> dict[str, Any]:
             "messages_lost": result.messages_lost,
             "recovered": bool(result.lost),
         },
-        "pose": {"source": result.poses.source, "rmse_m": rmse[0], "rmse_rad": rmse[1]} | _pose_spread(result),
+        "pose": {"source": result.poses.source, "rmse_m": rmse[0], "rmse_rad": rmse[1]} | _pose_uncertainty(result),
         "map": {
             "mapper": result.options.mapper,
             "resolution_m": frame.resolution,
@@ -53,9 +55,9 @@ def report(result: ReplayResult) -> dict[str, Any]:
             "evidence": _evidence(result.grid),
             "scores": result.scores.to_json() if result.scores else None,
         },
-        "primitives": _primitives(result.sighting),
-        "refine": {"noise_std_m": result.sighting.noise_std if result.sighting else None},
-        "errors": _errors(result.sighting),
+        "primitives": _primitives(result.detections),
+        "refine": {"noise_std_m": result.detections.noise_std if result.detections else None},
+        "errors": _errors(result.detections),
         "timing": {f"{name}_s": value for name, value in seconds.items()}
         | {
             "rays_per_s": result.rays / seconds["map"] if seconds["map"] else None,
@@ -64,11 +66,8 @@ def report(result: ReplayResult) -> dict[str, Any]:
     }
 
 
-def _pose_spread(result: ReplayResult) -> dict[str, Any]:
-    """How sure the poses are (root mean squares), and what they were fused from; nulls where nobody knows.
-
-    ``nees`` is the mean normalised error squared, 3 where the covariances are right.
-    """
+def _pose_uncertainty(result: ReplayResult) -> dict[str, Any]:
+    """Return the poses' standard deviations, their NEES, and the sensors they were fused from; None if not known."""
     std = pose_std(result.poses)
     return {
         "std_m": std and std[0],
@@ -90,35 +89,43 @@ def _pose_spread(result: ReplayResult) -> dict[str, Any]:
 
 
 def pose_std(poses: LaserPoses) -> tuple[float, float] | None:
-    """Root mean squares of the poses' standard deviations: of places (m, both axes together) and headings (rad)."""
+    """Return the root mean square standard deviations of position (m, both axes together) and heading (rad).
+
+    None where the poses have no covariances.
+    """
     if poses.covariances is None or not poses.valid.any():
         return None
     variances = poses.covariances[poses.valid].diagonal(axis1=1, axis2=2).mean(axis=0)
     return float(np.sqrt(variances[:2].sum())), float(np.sqrt(variances[2]))
 
 
-def _primitives(sighting: Sighting | None) -> list[dict[str, Any]]:
-    """What was found, best first."""
-    if sighting is None:
+def _primitives(result: DetectionResult | None) -> list[dict[str, Any]]:
+    """Return the detected primitives, highest score first."""
+    if result is None:
         return []
     return [
         {"id": identity.id}
-        | one.primitive.to_json()
+        | detection.primitive.to_json()
         | {
-            "score": one.score,
-            "stage": "detected" if one.std is None else "refined",
-            "std": None if one.std is None else dict(one.std),
-            "chances": None if one.chances is None else {str(kind): chance for kind, chance in one.chances.items()},
+            "score": detection.score,
+            "stage": "detected" if detection.std is None else "refined",
+            "std": None if detection.std is None else dict(detection.std),
+            "chances": _by_name(detection.kind_probabilities),
         }
-        for identity, one in zip(sighting.identities, sighting.detections.found, strict=True)
+        for identity, detection in zip(result.identities, result.detections.found, strict=True)
     ]
 
 
-def _errors(sighting: Sighting | None) -> dict[str, Any] | None:
-    """How what was found compares with the truth; lengths in metres, angles in radians."""
-    if sighting is None or sighting.errors is None:
+def _by_name(chances: Mapping[Kind, float] | None) -> dict[str, float] | None:
+    """Return the probabilities of the kinds by name; None where they are not known."""
+    return None if chances is None else {str(kind): chance for kind, chance in chances.items()}
+
+
+def _errors(result: DetectionResult | None) -> dict[str, Any] | None:
+    """Compare the detections with the truth (m, rad); None without ground truth."""
+    if result is None or result.errors is None:
         return None
-    errors, found = sighting.errors, sighting.detections.found
+    errors, found = result.errors, result.detections.found
     return {
         "precision": errors.precision,
         "recall": errors.recall,
@@ -130,10 +137,10 @@ def _errors(sighting: Sighting | None) -> dict[str, Any] | None:
         "iou": errors.iou,
         "pairs": [
             {
-                "id": sighting.identities[pair.detection].id,
+                "id": result.identities[pair.detection].id,
                 "truth": pair.truth,
                 "kind": str(found[pair.detection].primitive.kind),
-                "truth_kind": str(sighting.truth[pair.truth].kind),
+                "truth_kind": str(result.truth[pair.truth].kind),
                 "position_m": pair.position,
                 "angle_rad": pair.angle,
                 "width_m": pair.width,
@@ -146,7 +153,7 @@ def _errors(sighting: Sighting | None) -> dict[str, Any] | None:
 
 
 def _evidence(grid: OccupancyGrid) -> dict[str, Any] | None:
-    """How many rays are expected to have come to the cells that are known; None where the mapper does not say."""
+    """Summarize how many rays the known cells are based on; None for a mapper that does not count them."""
     if grid.evidence is None:
         return None
     known = grid.evidence[grid.occupied | grid.free]
@@ -154,54 +161,79 @@ def _evidence(grid: OccupancyGrid) -> dict[str, Any] | None:
     return {"cells_known": len(known), "rays_per_cell_quartiles": quartiles}
 
 
-def table(result: ReplayResult) -> list[tuple[str, str]]:
-    """The rows of the short table at the end: name, value with its unit."""
-    frame, seconds, scores = result.grid.frame, result.seconds, result.scores
+def summary_rows(result: ReplayResult) -> list[tuple[str, str]]:
+    """Return the rows of the table that ends a replay: name, and value with its unit."""
+    return [
+        *_map_rows(result),
+        *_pose_rows(result),
+        *_score_rows(result.scores),
+        *_detection_rows(result),
+        _time_row(result),
+    ]
+
+
+def _map_rows(result: ReplayResult) -> Iterator[tuple[str, str]]:
+    """Yield what was mapped, and how."""
+    frame = result.grid.frame
     x0, y0, x1, y1 = frame.bounds
     used = f"{result.scans_used} of {result.scans}" if result.scans_used != result.scans else f"{result.scans}"
-    rows = [
-        ("log", f"{result.path.name}, {result.duration:.1f} s, {used} scans, {result.rays:,} rays"),
-        ("poses", f"{result.poses.source} ({result.poses.origin}){', matched scans' * result.poses.matched}"),
-        ("map", f"{result.options.mapper}, {frame.cols} x {frame.rows} cells of {frame.resolution:g} m"),
-        ("bounds", f"x {x0:.2f} to {x1:.2f} m, y {y0:.2f} to {y1:.2f} m"),
-    ]
+    yield "log", f"{result.path.name}, {result.duration:.1f} s, {used} scans, {result.rays:,} rays"
+    yield "poses", f"{result.poses.source} ({result.poses.origin}){', matched scans' * result.poses.matched}"
+    yield "map", f"{result.options.mapper}, {frame.cols} x {frame.rows} cells of {frame.resolution:g} m"
+    yield "bounds", f"x {x0:.2f} to {x1:.2f} m, y {y0:.2f} to {y1:.2f} m"
     if result.noise_std is not None:
-        rows.append(("range noise", _noise(result.noise_std, result.options.noise_std is not None, frame.resolution)))
+        yield "range noise", _range_noise(result.noise_std, result.options.noise_std is not None, frame.resolution)
+
+
+def _pose_rows(result: ReplayResult) -> Iterator[tuple[str, str]]:
+    """Yield the noise of the sensors that were fused, and how far off the poses are."""
     if result.poses.sensors:
-        rows.append(("pose noise", "; ".join(_sensor_noise(sensor) for sensor in result.poses.sensors)))
+        yield "pose noise", "; ".join(_sensor_noise(sensor) for sensor in result.poses.sensors)
     std = pose_std(result.poses)
-    expected = f", expected {_length_and_turn(*std)}" if std else ""
     if result.pose_rmse is not None:
-        rows.append(("pose error", f"{_length_and_turn(*result.pose_rmse)} (RMS){expected}"))
+        expected = f", expected {_position_and_heading(*std)}" if std else ""
+        yield "pose error", f"{_position_and_heading(*result.pose_rmse)} (RMS){expected}"
     elif std:
-        rows.append(("pose std", f"{_length_and_turn(*std)} (RMS)"))
+        yield "pose std", f"{_position_and_heading(*std)} (RMS)"
+
+
+def _score_rows(scores: MapScores | None) -> Iterator[tuple[str, str]]:
+    """Yield how the map compares with the true world."""
     if scores is not None:
-        rows += [
-            ("occupied", f"precision {_percent(scores.occupied_precision)}, recall "
-             f"{_percent(scores.occupied_recall)}, F1 {_percent(scores.occupied_f1)} (within one cell)"),
-            ("free", f"{_percent(scores.free_accuracy)} right"),
-            ("AUC", "-" if scores.auc is None else f"{scores.auc:.4f}"),
-        ]  # fmt: skip
-    if result.sighting is not None:
-        rows.append(("primitives", _counted(result.sighting)))
-        if result.sighting.noise_std is not None and result.options.noise_std is None:
-            least = "at most " if result.sighting.noise_std <= LEAST_RAY_NOISE else ""
-            rows.append(("ray noise", f"{least}{result.sighting.noise_std * 1000:.1f} mm (found on the primitives)"))
-        if result.sighting.errors is not None:
-            rows += _quality(result.sighting.errors)
-    if result.blind is not None:
-        rows.append(("primitives", f"not looked for: {result.blind}"))
+        precision, recall = _percent(scores.occupied_precision), _percent(scores.occupied_recall)
+        f1 = _percent(scores.occupied_f1)
+        yield "occupied", f"precision {precision}, recall {recall}, F1 {f1} (within one cell)"
+        yield "free", f"{_percent(scores.free_accuracy)} right"
+        yield "AUC", "-" if scores.auc is None else f"{scores.auc:.4f}"
+
+
+def _detection_rows(result: ReplayResult) -> Iterator[tuple[str, str]]:
+    """Yield what was detected, and how it compares with the truth; or why detection was skipped."""
+    if result.detections is not None:
+        yield "primitives", _kind_counts(result.detections)
+        noise_std = result.detections.noise_std
+        if noise_std is not None and result.options.noise_std is None:
+            bound = "at most " if noise_std <= MIN_RAY_NOISE else ""
+            yield "ray noise", f"{bound}{noise_std * 1000:.1f} mm (found on the primitives)"
+        if result.detections.errors is not None:
+            yield from _error_rows(result.detections.errors)
+    if result.detection_skipped is not None:
+        yield "primitives", f"not looked for: {result.detection_skipped}"
+
+
+def _time_row(result: ReplayResult) -> tuple[str, str]:
+    """Return the time that the replay took, and the rate of mapping."""
+    seconds = result.seconds
     rate = result.rays / seconds["map"] / 1e6 if seconds["map"] else 0.0
-    rows.append(("time", f"{seconds['total']:.2f} s, mapping {seconds['map']:.3f} s ({rate:.2f} M rays/s)"))
-    return rows
+    return "time", f"{seconds['total']:.2f} s, mapping {seconds['map']:.3f} s ({rate:.2f} M rays/s)"
 
 
-def _length_and_turn(metres: float, radians: float) -> str:
+def _position_and_heading(metres: float, radians: float) -> str:
     return f"{metres * 1000:.1f} mm, {np.degrees(radians):.2f} deg"
 
 
-def _sensor_noise(sensor: Sensor) -> str:
-    """A sensor's noise in words."""
+def _sensor_noise(sensor: FusedSensor) -> str:
+    """Describe the noise of a sensor, and how many of its readings were rejected."""
     values = [f"{1000 * sensor.std['m']:.0f} mm"] if "m" in sensor.std else []
     values += [f"{np.degrees(sensor.std['rad']):.1f} deg"] if "rad" in sensor.std else []
     what = f"{sensor.name} {', '.join(values) or 'unknown'}"
@@ -210,15 +242,15 @@ def _sensor_noise(sensor: Sensor) -> str:
     return f"{what} ({sensor.rejected} of {sensor.used + sensor.rejected} not used)" if sensor.rejected else what
 
 
-def _counted(sighting: Sighting) -> str:
-    """How many of each kind were found."""
-    kinds = [one.primitive.kind for one in sighting.detections.found]
-    each = [counted(kinds.count(kind), kind) for kind in Kind if kind in kinds]
+def _kind_counts(result: DetectionResult) -> str:
+    """Count the detections of each kind."""
+    kinds = [detection.primitive.kind for detection in result.detections.found]
+    each = [pluralize(kinds.count(kind), kind) for kind in Kind if kind in kinds]
     return ", ".join(each) or "none found"
 
 
-def _quality(errors: DetectionErrors) -> Iterator[tuple[str, str]]:
-    """How much was found of what is there, and how far off it is on average."""
+def _error_rows(errors: DetectionErrors) -> Iterator[tuple[str, str]]:
+    """Yield precision and recall of the detections, and their mean errors."""
     found = f"precision {errors.precision:.1%}, recall {errors.recall:.1%}, F1 {errors.f1:.1%}"
     yield "detection", f"{found} (kind, IoU 0.5)"
     if errors.position is not None and errors.width is not None and errors.height is not None:
@@ -227,11 +259,11 @@ def _quality(errors: DetectionErrors) -> Iterator[tuple[str, str]]:
         yield "errors", f"position {1000 * errors.position:.1f} mm, size {size:.1f} mm{turn} (means)"
 
 
-def _noise(std: float, given: bool, resolution: float) -> str:
-    """The noise in words: what is found of noise that is no larger than a cell is mostly the cell."""
+def _range_noise(std: float, given: bool, resolution: float) -> str:
+    """Describe the range noise; an estimate that is no larger than a cell is mostly the size of the cell."""
     if given:
         return f"{std * 1000:.1f} mm (as given)"
-    if std < CELLS_LIMIT * resolution:
+    if std < MIN_NOISE_CELLS * resolution:
         return f"at most {std * 1000:.1f} mm (cells of {resolution * 1000:g} mm show no less)"
     return f"{std * 1000:.1f} mm (standard deviation)"
 

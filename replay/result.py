@@ -1,4 +1,4 @@
-"""What a replay comes to."""
+"""The result of a replay."""
 
 from __future__ import annotations
 
@@ -10,14 +10,36 @@ from numpy.typing import NDArray
 
 from mapping.grid import OccupancyGrid
 from mapping.map_metrics import MapScores
-from replay.detection import Sighting
+from replay.detection import DetectionResult
 from replay.options import ReplayOptions
-from replay.poses.localize import LaserPoses
+from replay.poses.laser_poses import LaserPoses
 
 
 @dataclass(frozen=True)
 class ReplayResult:
-    """All that a replay found out; ``blind`` says why primitives were not looked for, where they should have been."""
+    """All that a replay found out.
+
+    Attributes:
+        path: The log's path.
+        options: The options of the replay.
+        duration: The time from the earliest selected scan to the latest (s).
+        scans: The number of scans on the topic.
+        scans_used: The number of scans that were mapped.
+        rays: The number of their rays.
+        lost: Parts of the log that could not be read.
+        notes: What a user should know.
+        messages_lost: The number of messages that could not be read; None where it is not known.
+        poses: The laser's poses at the selected scans.
+        stamps: Stamps (N,) of the selected scans (ns).
+        pose_rmse: Root mean square position (m) and heading (rad) errors; None where poses are not compared.
+        pose_nees: Mean normalized estimation error squared of the poses; None without covariances or truth.
+        grid: The map.
+        noise_std: The range noise that the mapper assumes (m); None for a mapper without one.
+        scores: Scores of the map; None without ground truth.
+        detections: The primitives in the map; None where detection was skipped.
+        detection_skipped: Why detection was not possible, where it was wanted; None otherwise.
+        seconds: Wall time of each stage, and ``total``, by name (s).
+    """
 
     path: Path
     options: ReplayOptions
@@ -35,6 +57,6 @@ class ReplayResult:
     grid: OccupancyGrid
     noise_std: float | None
     scores: MapScores | None
-    sighting: Sighting | None
-    blind: str | None
+    detections: DetectionResult | None
+    detection_skipped: str | None
     seconds: dict[str, float]

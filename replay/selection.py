@@ -14,9 +14,17 @@ from prim.errors import UsageError
 
 @dataclass(frozen=True)
 class Selection:
-    """Which scans to replay: seconds after the first scan, a number of scans, every ``stride``-th.
+    """Which scans to replay.
 
-    Raises UsageError on a selection that can hold nothing.
+    Attributes:
+        start: Seconds from the log's earliest scan to the first that is wanted.
+        end: Seconds from the log's earliest scan to the last that is wanted; excludes ``duration``.
+        duration: Seconds from ``start`` to the last scan that is wanted.
+        n_scans: The largest number of scans.
+        stride: Every ``stride``-th scan is taken.
+
+    Raises:
+        UsageError: The selection cannot contain anything.
     """
 
     start: float | None = None
@@ -42,8 +50,8 @@ class Selection:
         if self.end is not None and self.end <= (self.start or 0.0):
             raise UsageError(f"--end {self.end:g} is not after --start {self.start or 0:g}")
 
-    def pick(self, stamps: Stamps) -> NDArray[np.intp]:
-        """Indices of the selected scans among all, in the log's order."""
+    def select(self, stamps: Stamps) -> NDArray[np.intp]:
+        """Return the indices of the selected scans among those with ``stamps`` (N,) in ns, in the log's order."""
         seconds = (stamps - stamps.min()) / 1e9
         start = self.start or 0.0
         end = start + self.duration if self.duration is not None else self.end

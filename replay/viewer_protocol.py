@@ -1,4 +1,4 @@
-"""What a replay shows while it runs, and a viewer that shows nothing."""
+"""What a replay shows while it runs: the viewer's protocol, and a viewer that shows nothing."""
 
 from __future__ import annotations
 
@@ -8,21 +8,28 @@ from typing import TYPE_CHECKING, Protocol
 
 from mapping.grid import OccupancyGrid
 from mapping.map_metrics import MapScores
-from prim.arrays import FloatArray
 from prim.errors import UsageError
-from prim.se2 import Pose2D
+from prim.scan import PosedScan
 from prim.world import Bounds, World
 
 if TYPE_CHECKING:
-    from replay.detection import Sighting
+    from replay.detection import DetectionResult
     from replay.result import ReplayResult
 
 
 @dataclass(frozen=True)
 class ViewerOptions:
-    """Where a recording goes: a file, a new viewer, a viewer that runs at a URL, or web browsers.
+    """Where a recording goes.
 
-    ``live`` sends every scan at once, as a replay that is held to a rate wants it. Raises UsageError.
+    Attributes:
+        save: A file.
+        spawn: A new viewer.
+        connect: The URL of a viewer that runs.
+        serve: Web browsers.
+        live: Every scan is sent at once, as a replay that is held to a rate wants it.
+
+    Raises:
+        UsageError: Two of them exclude each other.
     """
 
     save: Path | None = None
@@ -39,7 +46,7 @@ class ViewerOptions:
 
     @property
     def watched(self) -> bool:
-        """Whether somebody may look at the replay while it runs."""
+        """Whether somebody may be watching the replay while it runs."""
         return self.spawn or self.serve or self.connect is not None
 
 
@@ -47,9 +54,15 @@ class ViewerOptions:
 class Scene:
     """What is known before the first scan.
 
-    The log's name, the mapper, the map's bounds (m), whether the map and the poses are held against the truth, and
-    whether the mapper says how much evidence each cell has; whether primitives are looked for, and held against the
-    truth.
+    Attributes:
+        log: The log's name.
+        mapper: The mapper.
+        bounds: The map's bounds (m): x0, y0, x1, y1.
+        has_scores: Whether the map is scored against ground truth.
+        has_pose_errors: Whether the poses are compared with the true ones.
+        has_evidence: Whether the mapper counts the rays of each cell.
+        has_detections: Whether primitives are detected.
+        has_errors: Whether the detections are evaluated against ground truth.
     """
 
     log: str
@@ -63,69 +76,107 @@ class Scene:
 
 
 class Viewer(Protocol):
-    """Shows a replay on a timeline; ``position`` counts the scans, ``stamp`` is in ns.
+    """Shows a replay on a timeline.
 
-    ``shows`` is False for one that shows nothing, so that no map need be made for it on the way.
+    Attributes:
+        shows: False for a viewer that shows nothing, so that no snapshots of the map need be made for it.
     """
 
     shows: bool
 
     def begin(self, scene: Scene) -> None:
-        """Sets the scene."""
+        """Prepare for what is described by ``scene``."""
 
     def show_truth(self, position: int, stamp: int, world: World) -> None:
-        """The true world from now on."""
+        """Show the true world; called with every scan, and of effect where the world has changed.
 
-    def show_scan(self, position: int, stamp: int, pose: Pose2D, points: FloatArray, seconds: float) -> None:
-        """The laser's pose, a scan's end points (M, 2) in the map frame, and the mapper's seconds for it."""
+        Args:
+            position: The scan's position in the selection.
+            stamp: Its stamp (ns).
+            world: The world at that time.
+        """
+
+    def show_scan(self, posed: PosedScan, seconds: float) -> None:
+        """Show a scan and the laser's pose.
+
+        Args:
+            posed: The scan with its pose.
+            seconds: The time that it took to map (s).
+        """
 
     def show_map(self, position: int, stamp: int, grid: OccupancyGrid, scores: MapScores | None) -> None:
-        """The map so far and its scores against the truth."""
+        """Show the map so far.
 
-    def show_pose_error(self, position: int, stamp: int, metres: float, radians: float, pose: Pose2D) -> None:
-        """How far the pose in use is from the true one."""
+        Args:
+            position: The latest scan's position in the selection.
+            stamp: Its stamp (ns).
+            grid: The map.
+            scores: Its scores; None without ground truth.
+        """
 
-    def show_sighting(self, position: int, stamp: int, sighting: Sighting) -> None:
-        """The primitives found in the map so far."""
+    def show_pose_error(self, posed: PosedScan, position_error: float, heading_error: float) -> None:
+        """Show how far the pose of a scan is from the true one.
+
+        Args:
+            posed: The scan with its pose.
+            position_error: Distance between the positions (m).
+            heading_error: Difference of the headings (rad).
+        """
+
+    def show_detections(self, position: int, stamp: int, result: DetectionResult) -> None:
+        """Show the primitives in the map so far.
+
+        Args:
+            position: The latest scan's position in the selection.
+            stamp: Its stamp (ns).
+            result: The detections.
+        """
 
     def event(self, position: int, stamp: int, text: str, warning: bool = False) -> None:
-        """A line for the log of events."""
+        """Add a line to the log of events.
+
+        Args:
+            position: The latest scan's position in the selection.
+            stamp: Its stamp (ns).
+            text: The line.
+            warning: Whether it is a warning.
+        """
 
     def finish(self, result: ReplayResult) -> None:
-        """The result; nothing is shown after it."""
+        """Show the result, and close; nothing is shown after it."""
 
     def abandon(self) -> None:
-        """The replay failed: what was shown of it is not kept."""
+        """Discard what was shown: the replay failed."""
 
 
 class NullViewer:
-    """Shows nothing."""
+    """A viewer that shows nothing."""
 
     shows = False
 
     def begin(self, scene: Scene) -> None:
-        """Nothing."""
+        """See :meth:`Viewer.begin`."""
 
     def show_truth(self, position: int, stamp: int, world: World) -> None:
-        """Nothing."""
+        """See :meth:`Viewer.show_truth`."""
 
-    def show_scan(self, position: int, stamp: int, pose: Pose2D, points: FloatArray, seconds: float) -> None:
-        """Nothing."""
+    def show_scan(self, posed: PosedScan, seconds: float) -> None:
+        """See :meth:`Viewer.show_scan`."""
 
     def show_map(self, position: int, stamp: int, grid: OccupancyGrid, scores: MapScores | None) -> None:
-        """Nothing."""
+        """See :meth:`Viewer.show_map`."""
 
-    def show_pose_error(self, position: int, stamp: int, metres: float, radians: float, pose: Pose2D) -> None:
-        """Nothing."""
+    def show_pose_error(self, posed: PosedScan, position_error: float, heading_error: float) -> None:
+        """See :meth:`Viewer.show_pose_error`."""
 
-    def show_sighting(self, position: int, stamp: int, sighting: Sighting) -> None:
-        """Nothing."""
+    def show_detections(self, position: int, stamp: int, result: DetectionResult) -> None:
+        """See :meth:`Viewer.show_detections`."""
 
     def event(self, position: int, stamp: int, text: str, warning: bool = False) -> None:
-        """Nothing."""
+        """See :meth:`Viewer.event`."""
 
     def finish(self, result: ReplayResult) -> None:
-        """Nothing."""
+        """See :meth:`Viewer.finish`."""
 
     def abandon(self) -> None:
-        """Nothing."""
+        """See :meth:`Viewer.abandon`."""

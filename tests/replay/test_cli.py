@@ -1,4 +1,4 @@
-"""prim-replay as users run it: outputs, exit codes, one line per error."""
+"""The command line prim-replay: outputs, exit codes, one line per error."""
 
 import json
 import math
@@ -15,7 +15,7 @@ from detect.networks.weights import shipped_weights
 from mapping.mapper import MAPPERS
 from prim import console
 from recorder.sensors import Lidar
-from recorder.session import Session, SessionOptions, record
+from recorder.session import Session, SessionOptions, record_session
 from replay.cli import app, join_bounds
 
 Run = Callable[..., tuple[int, str, str]]
@@ -23,7 +23,7 @@ Run = Callable[..., tuple[int, str, str]]
 
 @pytest.fixture
 def replay(in_tmp: Path, capsys: pytest.CaptureFixture[str]) -> Run:
-    """Runs prim-replay in an empty folder: exit code, stdout, stderr."""
+    """Run prim-replay in an empty folder; return exit code, stdout, stderr."""
 
     def run(*arguments: object) -> tuple[int, str, str]:
         code = console.run(app, "prim-replay", join_bounds([str(argument) for argument in arguments]))
@@ -39,7 +39,9 @@ def report_of(path: str) -> dict[str, Any]:
 
 
 @pytest.mark.parametrize("mapper", MAPPERS)
-def test_a_plain_replay_leaves_a_recording_and_a_report(replay: Run, noisy_session: Session, mapper: str) -> None:
+def test_a_replay_writes_a_recording_and_a_report_by_default(
+    replay: Run, noisy_session: Session, mapper: str
+) -> None:
     code, out, err = replay(noisy_session.path, "--mapper", mapper)
     assert (code, err) == (0, "")
     assert {path.name for path in Path().iterdir()} == {f"noisy.{mapper}.rrd", f"noisy.{mapper}.report.json"}
@@ -90,7 +92,7 @@ def test_a_plain_replay_leaves_a_recording_and_a_report(replay: Run, noisy_sessi
         ("--no-viewer --no-detect", {"rerun", "torch", "matplotlib", "shapely", "onnxruntime"}, {"report.json"}),
     ],
 )
-def test_what_is_not_asked_for_is_neither_loaded_nor_written(
+def test_unused_libraries_are_not_loaded_and_unused_outputs_not_written(
     noisy_session: Session, tmp_path: Path, options: str, heavy: set[str], files: set[str]
 ) -> None:
     code = (
@@ -133,7 +135,7 @@ def test_all_outputs_can_be_named(replay: Run, noisy_session: Session) -> None:
     assert lines[0][0] == "1735689600.000000000"
 
 
-def test_the_nav2_map_reads_back_as_the_grid(replay: Run, noisy_session: Session) -> None:
+def test_the_nav2_map_is_read_back_as_the_grid(replay: Run, noisy_session: Session) -> None:
     """As nav2's map_server reads it: trinary, first image row at the top, the origin at the lower left."""
     from replay.options import ReplayOptions
     from replay.pipeline import Pipeline
@@ -201,13 +203,13 @@ def test_a_laser_offset_moves_the_map(replay: Run, noisy_session: Session) -> No
     assert np.cos(turn) == pytest.approx(0, abs=1e-6)
 
 
-def test_rate_holds_the_replay(replay: Run, noisy_session: Session) -> None:
-    """Not a timing test: it may take longer, but it must not take less than asked for."""
+def test_a_replay_is_not_faster_than_its_rate(replay: Run, noisy_session: Session) -> None:
+    """A replay may be slower than the rate, but not faster."""
     assert replay(noisy_session.path, "--n-scans", 6, "--rate", 2, "--no-viewer")[0] == 0
     assert report_of("noisy.prob.report.json")["timing"]["total_s"] >= 0.25
 
 
-def test_several_logs(replay: Run, noisy_session: Session, quiet_session: Session) -> None:
+def test_several_logs_have_outputs_of_their_own(replay: Run, noisy_session: Session, quiet_session: Session) -> None:
     assert replay(noisy_session.path, quiet_session.path, "--mapper", "det", "--no-viewer")[0] == 0
     assert {path.name for path in Path().iterdir()} == {"noisy.det.report.json", "quiet.det.report.json"}
     code, _, err = replay(noisy_session.path, quiet_session.path, "--map", "m")
@@ -219,7 +221,7 @@ def test_several_logs(replay: Run, noisy_session: Session, quiet_session: Sessio
         assert replay(*logs, "--no-viewer")[0] == 2
 
 
-def test_one_bad_log_does_not_keep_the_others(replay: Run, noisy_session: Session) -> None:
+def test_an_unreadable_log_does_not_stop_the_others(replay: Run, noisy_session: Session) -> None:
     Path("bad.mcap").write_bytes(b"")
     code, _, err = replay("bad.mcap", noisy_session.path, "--no-viewer")
     assert (code, err.count("\n")) == (1, 1)
@@ -227,7 +229,7 @@ def test_one_bad_log_does_not_keep_the_others(replay: Run, noisy_session: Sessio
 
 
 @pytest.mark.parametrize("option", ["--save", "--report", "--trajectory"])
-def test_no_output_goes_over_a_log(replay: Run, noisy_session: Session, option: str) -> None:
+def test_no_output_overwrites_a_log(replay: Run, noisy_session: Session, option: str) -> None:
     before = noisy_session.path.read_bytes()
     code, _, err = replay(noisy_session.path, option, noisy_session.path)
     assert (code, "is a log" in err) == (2, True)
@@ -245,14 +247,14 @@ def test_a_replay_that_fails_keeps_the_earlier_recording(replay: Run, noisy_sess
     assert {path.name for path in Path().iterdir()} == {"a.rrd", "bad.mcap"}
 
 
-def test_max_range(replay: Run, noisy_session: Session) -> None:
+def test_max_range_leaves_fewer_occupied_cells(replay: Run, noisy_session: Session) -> None:
     assert replay(noisy_session.path, "--max-range", 0.3, "--no-viewer", "--map", "near")[0] == 0
     assert replay(noisy_session.path, "--no-viewer", "--map", "far")[0] == 0
     near, far = (np.frombuffer(Path(f"{name}.pgm").read_bytes()[-220 * 220 :], np.uint8) for name in ("near", "far"))
     assert np.count_nonzero(near == 0) < np.count_nonzero(far == 0)
 
 
-def test_bounds_that_see_nothing_are_said(replay: Run, noisy_session: Session) -> None:
+def test_bounds_without_any_ray_are_noted(replay: Run, noisy_session: Session) -> None:
     code, _, err = replay(noisy_session.path, "--bounds", 100, 100, 101, 101, "--no-viewer")
     assert (code, "no ray crosses the map's bounds" in err) == (0, True)
 
@@ -272,7 +274,7 @@ def test_a_truncated_log_is_refused_and_salvaged_with_exit_code_3(replay: Run, n
 
 @pytest.mark.parametrize(("noise", "expected"), [([], 0.05), (["--noise-std", "0.2"], 0.2)])
 @pytest.mark.parametrize("kind", [["--sensor-model", "gaussian"], ["--mapper", "forward"]])
-def test_the_noise_is_given_or_found(
+def test_the_range_noise_is_given_or_estimated(
     replay: Run, noisy_session: Session, kind: list[str], noise: list[str], expected: float
 ) -> None:
     assert replay(noisy_session.path, "--no-viewer", "--report", "a.json", *kind, *noise)[0] == 0
@@ -281,7 +283,7 @@ def test_the_noise_is_given_or_found(
 
 
 @pytest.mark.parametrize(
-    ("options", "said"),
+    ("options", "message"),
     [
         (["--resolution", "0"], "--resolution"),
         (["--resolution", "nan"], "--resolution"),
@@ -316,42 +318,46 @@ def test_the_noise_is_given_or_found(
         (["--nonsense"], "--nonsense"),
     ],
 )
-def test_impossible_options(replay: Run, noisy_session: Session, options: list[str], said: str) -> None:
+def test_impossible_options_are_refused_in_one_line(
+    replay: Run, noisy_session: Session, options: list[str], message: str
+) -> None:
     code, out, err = replay(noisy_session.path, *options)
     assert (code, out) == (2, "")
-    assert said in err
+    assert message in err
     assert err.startswith("prim-replay: error: ")
     assert err.count("\n") == 1
     assert list(Path().iterdir()) == []
 
 
-def test_selections_that_hold_nothing(replay: Run, noisy_session: Session) -> None:
+def test_empty_selections_are_refused(replay: Run, noisy_session: Session) -> None:
     code, _, err = replay(noisy_session.path, "--start", 1000, "--no-viewer")
     assert (code, "no scan is selected" in err) == (1, True)
 
 
 @pytest.mark.parametrize("option", ["--save", "--report", "--map", "--trajectory"])
-def test_unwritable_outputs(replay: Run, noisy_session: Session, option: str) -> None:
+def test_unwritable_outputs_are_refused(replay: Run, noisy_session: Session, option: str) -> None:
     code, _, err = replay(noisy_session.path, option, "no/such/folder")
     assert code == 1
     assert "cannot write" in err and err.count("\n") == 1
 
 
-def test_spawn_without_a_display(replay: Run, noisy_session: Session, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_spawn_without_a_display_is_refused(
+    replay: Run, noisy_session: Session, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.delenv("DISPLAY", raising=False)
     monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
     code, _, err = replay(noisy_session.path, "--spawn")
     assert (code, "--save" in err, err.count("\n")) == (2, True, 1)
 
 
-def test_a_viewer_that_does_not_answer(replay: Run, noisy_session: Session) -> None:
+def test_a_viewer_that_does_not_answer_is_reported(replay: Run, noisy_session: Session) -> None:
     code, _, err = replay(noisy_session.path, "--connect", "rerun+http://127.0.0.1:9/proxy", "--n-scans", 3)
     assert code == 1
     assert "no viewer answers" in err and err.count("\n") == 1
 
 
 @pytest.mark.parametrize("content", [b"", b"\x89PNG\r\n\x1a\nxxxxxxxxxxxxxxxx"])
-def test_files_that_are_no_logs(replay: Run, content: bytes) -> None:
+def test_files_that_are_not_logs_are_refused(replay: Run, content: bytes) -> None:
     Path("a.mcap").write_bytes(content)
     code, out, err = replay("a.mcap")
     assert (code, out) == (1, "")
@@ -360,7 +366,7 @@ def test_files_that_are_no_logs(replay: Run, content: bytes) -> None:
     assert [path.name for path in Path().iterdir()] == ["a.mcap"]
 
 
-def test_a_missing_file_and_a_folder(replay: Run, tmp_path: Path) -> None:
+def test_a_missing_file_and_an_empty_folder_are_refused(replay: Run, tmp_path: Path) -> None:
     for path in ("none.mcap", tmp_path):
         code, _, err = replay(path)
         assert (code, err.count("\n")) == (1, 1)
@@ -371,11 +377,11 @@ def driven_session(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A driven session: 15 s, 60 scans of 120 rays."""
     path = tmp_path_factory.mktemp("driven") / "driven.mcap"
     options = SessionOptions(seed=2, motion="drive", duration=15.0, rate=4.0, lidar=Lidar(rays=120))
-    return record(path, options).path
+    return record_session(path, options).path
 
 
 @pytest.mark.parametrize("mapper", MAPPERS)
-def test_fused_poses_say_how_sure_they_are(replay: Run, driven_session: Path, mapper: str) -> None:
+def test_fused_poses_are_reported_with_their_uncertainty(replay: Run, driven_session: Path, mapper: str) -> None:
     code, out, err = replay(driven_session, "--pose", "fused", "--mapper", mapper, "--trajectory", "fused.tum")
     assert (code, err) == (0, "")
     pose = report_of(f"driven.{mapper}.report.json")["pose"]
@@ -389,12 +395,12 @@ def test_fused_poses_say_how_sure_they_are(replay: Run, driven_session: Path, ma
 
 
 @pytest.mark.parametrize(("sensors", "topics"), [("gps,odom", "/odom, /gps"), ("gps, compass", "/gps, /compass")])
-def test_some_of_the_sensors(replay: Run, driven_session: Path, sensors: str, topics: str) -> None:
+def test_only_the_chosen_sensors_are_fused(replay: Run, driven_session: Path, sensors: str, topics: str) -> None:
     code, out, _ = replay(driven_session, "--pose", "fused", "--fuse", sensors, "--no-viewer", "--no-detect")
     assert code == 0 and f"fused ({topics})" in out
 
 
-def test_noise_of_poses_is_what_is_given(replay: Run, driven_session: Path) -> None:
+def test_given_pose_noise_is_used(replay: Run, driven_session: Path) -> None:
     given = ["--pose-noise", 0.2, 5, "--odom-noise", 0.1, 4, "--gps-topic", "/gps", "--compass-topic", "/compass"]
     assert replay(driven_session, "--pose", "fused", *given, "--no-viewer", "--no-detect")[0] == 0
     sensors = report_of("driven.prob.report.json")["pose"]["sensors"]
@@ -413,12 +419,12 @@ def test_matched_scans_correct_odometry(replay: Run, driven_session: Path, optio
     after = report_of("driven.prob.report.json")["pose"]
     assert code == 0 and "odom (/odom), matched scans" in out
     assert after["matched"] and not before["matched"] and after["std_m"] > 0
-    if not options:  # what drifts is no noise: told so, they stay where they are on average
+    if not options:  # with --pose-noise, drift is taken for noise and stays
         assert after["rmse_m"] < before["rmse_m"] / 2
 
 
 @pytest.mark.parametrize(
-    ("options", "what"),
+    ("options", "message"),
     [
         (["--fuse", "sonar"], "sonar is no sensor; they are odom, gps, compass"),
         (["--fuse", "odom,"], "an empty name is no sensor"),
@@ -430,19 +436,19 @@ def test_matched_scans_correct_odometry(replay: Run, driven_session: Path, optio
         (["--standing-still", "--match-scans"], "excludes --match-scans"),
     ],
 )
-def test_options_of_poses_that_make_no_sense(
-    replay: Run, driven_session: Path, options: list[object], what: str
+def test_contradicting_pose_options_are_refused(
+    replay: Run, driven_session: Path, options: list[object], message: str
 ) -> None:
     code, _, err = replay(driven_session, *options)
-    assert code == 2 and what in err and len(err.splitlines()) == 1
+    assert code == 2 and message in err and len(err.splitlines()) == 1
 
 
-def test_what_is_not_fused_is_said(replay: Run, driven_session: Path) -> None:
+def test_unused_fusion_options_are_noted(replay: Run, driven_session: Path) -> None:
     _, _, err = replay(driven_session, "--fuse", "gps,compass", "--no-viewer", "--no-detect")
     assert "nothing is fused, since there are poses on /ground_truth/pose: give --pose fused" in err
 
 
-def test_sensors_that_are_not_there(replay: Run, driven_session: Path) -> None:
+def test_missing_sensors_are_reported(replay: Run, driven_session: Path) -> None:
     code, _, err = replay(driven_session, "--pose", "fused", "--fuse", "gps")
     assert code == 1 and "fused poses need odometry, or a GPS and a compass: there is /gps" in err
     code, _, err = replay(driven_session, "--pose", "fused", "--gps-topic", "/odom")

@@ -1,4 +1,4 @@
-"""Primitives in a replay: the report, the recording, the detector's own map; with a detector that knows the truth."""
+"""Detection in a replay: the report, the recording, the detector's own map; with a detector that knows the truth."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import pytest
 
 from detect.detection import Detection, Detections, Rejection
 from detect.detector import Detector
-from detect.networks.weights import Card
+from detect.networks.weights import ModelCard
 from mapping.grid import OccupancyGrid
 from mapping.mapper import MAPPERS
 from prim import console
@@ -19,20 +19,20 @@ from prim.errors import UsageError
 from prim.shapes import Kind, Primitive
 from recorder.session import Session
 from replay import cli
-from replay.detection import spread_by_frame
+from replay.detection import add_frame_uncertainty
 from replay.options import ReplayOptions
 from replay.pipeline import Pipeline
-from replay.report import report, table
+from replay.report import report_json, summary_rows
 from replay.result import ReplayResult
 from replay.viewer import RerunViewer
 from replay.viewer_protocol import ViewerOptions
 from tests.replay.test_viewer import rows_of, timed, value
 
 
-class Knowing:
-    """A detector that finds what is there, 10 mm to the right, and rejects one candidate; ``seen`` are its maps."""
+class FakeDetector:
+    """Detects all primitives, 10 mm to the right, and rejects one candidate; ``seen`` are the maps it was given."""
 
-    card = Card("yolo", "any")
+    card = ModelCard("yolo", "any")
 
     def __init__(self, session: Session) -> None:
         self.session = session
@@ -41,16 +41,16 @@ class Knowing:
     def detect(self, grid: OccupancyGrid) -> Detections:
         self.seen.append(grid)
         crop = np.full((72, 72), 7, np.uint8)
-        moved = [replace(one, x=one.x + 0.01) for one in self.session.world.primitives]
+        shifted = [replace(primitive, x=primitive.x + 0.01) for primitive in self.session.world.primitives]
         rejection = Rejection(Kind.CIRCLE, 0.1, 0.5, 0.25, "score 0.10 is below 0.30, the least for a circle")
-        return Detections(tuple(Detection(one, 0.9, (0.0, 0.0, 0.1, 0.1), crop) for one in moved), (rejection,))
+        return Detections(tuple(Detection(p, 0.9, (0.0, 0.0, 0.1, 0.1), crop) for p in shifted), (rejection,))
 
 
 @pytest.fixture
-def knowing(noisy_session: Session, monkeypatch: pytest.MonkeyPatch) -> Knowing:
-    made = Knowing(noisy_session)
-    monkeypatch.setattr(Detector, "load", lambda path, mapper=None, threads=None: made)
-    return made
+def detector(noisy_session: Session, monkeypatch: pytest.MonkeyPatch) -> FakeDetector:
+    fake = FakeDetector(noisy_session)
+    monkeypatch.setattr(Detector, "load", lambda path, mapper=None, threads=None: fake)
+    return fake
 
 
 def replayed(session: Session, viewer: RerunViewer | None = None, **options: object) -> ReplayResult:
@@ -59,38 +59,40 @@ def replayed(session: Session, viewer: RerunViewer | None = None, **options: obj
 
 
 @pytest.mark.parametrize("mapper", MAPPERS)
-def test_the_report_lists_what_was_found(noisy_session: Session, knowing: Knowing, mapper: str) -> None:
-    told = report(replayed(noisy_session, mapper=mapper))
-    assert json.loads(json.dumps(told)) == told
+def test_the_report_lists_the_detections(noisy_session: Session, detector: FakeDetector, mapper: str) -> None:
+    report = report_json(replayed(noisy_session, mapper=mapper))
+    assert json.loads(json.dumps(report)) == report
     truth = noisy_session.world.primitives
-    assert [one["id"] for one in told["primitives"]] == list(range(1, len(truth) + 1))
-    for one, true in zip(told["primitives"], truth, strict=True):
+    assert [one["id"] for one in report["primitives"]] == list(range(1, len(truth) + 1))
+    for one, true in zip(report["primitives"], truth, strict=True):
         assert (one["kind"], one["stage"], one["score"], one["std"]) == (true.kind, "detected", 0.9, None)
         assert one["x"] == pytest.approx(true.x + 0.01) and one["size"] == true.sizes
-    errors = told["errors"]
+    errors = report["errors"]
     assert [errors[name] for name in ("position_m", "width_m", "angle_rad")] == pytest.approx([0.01, 0, 0], abs=1e-9)
     assert {pair["truth"]: pair["id"] for pair in errors["pairs"]} == {k: k + 1 for k in range(len(truth))}
-    assert told["timing"]["detect_s"] > 0
-    assert len(knowing.seen) == 1
+    assert report["timing"]["detect_s"] > 0
+    assert len(detector.seen) == 1
 
 
 @pytest.mark.parametrize("mapper", MAPPERS)
-def test_what_was_found_is_refined_by_the_rays(noisy_session: Session, knowing: Knowing, mapper: str) -> None:
+def test_detections_are_refined_with_the_rays(noisy_session: Session, detector: FakeDetector, mapper: str) -> None:
     """The detector is 10 mm off; the rays are not, though their noise is 50 mm."""
-    told = report(replayed(noisy_session, mapper=mapper, refine=True))
-    assert json.loads(json.dumps(told)) == told
-    assert told["errors"]["f1"] > 0.7  # two of seven cannot be told from a circle and a square in so few rays
-    assert told["errors"]["position_m"] < 0.004
-    for one in told["primitives"]:
+    report = report_json(replayed(noisy_session, mapper=mapper, refine=True))
+    assert json.loads(json.dumps(report)) == report
+    assert report["errors"]["f1"] > 0.7  # two of seven cannot be told from a circle and a square in so few rays
+    assert report["errors"]["position_m"] < 0.004
+    for one in report["primitives"]:
         assert one["stage"] == "refined" and 0 < one["score"] <= 1
         assert set(one["std"]) == {"x", "y", *one["size"], *(["theta"] if one["theta"] is not None else [])}
         assert all(0 < value < (1.0 if name == "theta" else 0.3) for name, value in one["std"].items())
         assert one["chances"][one["kind"]] == one["score"] == max(one["chances"].values())
-    assert told["refine"]["noise_std_m"] == pytest.approx(0.05, rel=0.15)
-    assert told["timing"]["refine_s"] > 0
+    assert report["refine"]["noise_std_m"] == pytest.approx(0.05, rel=0.15)
+    assert report["timing"]["refine_s"] > 0
 
 
-def test_refinement_on_the_way_is_on_the_timeline(noisy_session: Session, knowing: Knowing, tmp_path: Path) -> None:
+def test_intermediate_refinements_are_on_the_timeline(
+    noisy_session: Session, detector: FakeDetector, tmp_path: Path
+) -> None:
     viewer = RerunViewer(ViewerOptions(save=tmp_path / "a.rrd"), announce=print)
     replayed(noisy_session, viewer, mapper="forward", detect_every=10, refine=True)
     rows = rows_of(tmp_path / "a.rrd")
@@ -101,12 +103,14 @@ def test_refinement_on_the_way_is_on_the_timeline(noisy_session: Session, knowin
     assert len(value(bands[-1], "strips")) == 2 * len(value(timed(rows["/map/detections"])[-1], "strips"))
 
 
-def test_no_detection_where_none_is_wanted(noisy_session: Session, knowing: Knowing) -> None:
-    told = report(Pipeline(noisy_session.path, ReplayOptions(detect=False)).run())
-    assert told["primitives"] == [] and told["errors"] is None and knowing.seen == []
+def test_no_detection_when_switched_off(noisy_session: Session, detector: FakeDetector) -> None:
+    report = report_json(Pipeline(noisy_session.path, ReplayOptions(detect=False)).run())
+    assert report["primitives"] == [] and report["errors"] is None and detector.seen == []
 
 
-def test_detection_on_the_way_is_on_the_timeline(noisy_session: Session, knowing: Knowing, tmp_path: Path) -> None:
+def test_intermediate_detections_are_on_the_timeline(
+    noisy_session: Session, detector: FakeDetector, tmp_path: Path
+) -> None:
     viewer = RerunViewer(ViewerOptions(save=tmp_path / "a.rrd"), announce=print)
     result = replayed(noisy_session, viewer, mapper="prob", detect_every=10)
     rows = rows_of(tmp_path / "a.rrd")
@@ -125,17 +129,17 @@ def test_detection_on_the_way_is_on_the_timeline(noisy_session: Session, knowing
     assert "| 1 |" in value(timed(rows["/detections"])[-1], "text")[0]
 
 
-def test_the_detector_keeps_a_map_of_its_own(noisy_session: Session, knowing: Knowing) -> None:
+def test_the_detector_has_a_map_of_its_own_resolution(noisy_session: Session, detector: FakeDetector) -> None:
     result = replayed(noisy_session, mapper="prob", resolution=0.05, detect_every=12)
     assert result.grid.frame.resolution == 0.05
-    assert {grid.frame.resolution for grid in knowing.seen} == {0.01} and len(knowing.seen) > 1
-    assert [np.count_nonzero(grid.occupied) for grid in knowing.seen] == sorted(
-        np.count_nonzero(grid.occupied) for grid in knowing.seen
+    assert {grid.frame.resolution for grid in detector.seen} == {0.01} and len(detector.seen) > 1
+    assert [np.count_nonzero(grid.occupied) for grid in detector.seen] == sorted(
+        np.count_nonzero(grid.occupied) for grid in detector.seen
     )
 
 
-def test_rejected_candidates_are_told_at_verbose(
-    noisy_session: Session, knowing: Knowing, in_tmp: Path, capsys: pytest.CaptureFixture[str]
+def test_rejected_candidates_are_printed_with_verbose(
+    noisy_session: Session, detector: FakeDetector, in_tmp: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     command = [str(noisy_session.path), "--weights", "w", "--no-refine", "--no-viewer", "--verbose"]
     assert console.run(cli.app, "prim-replay", command) == 0
@@ -146,7 +150,7 @@ def test_rejected_candidates_are_told_at_verbose(
 
 
 @pytest.mark.parametrize(
-    ("options", "said"),
+    ("options", "message"),
     [
         ({"detect": False, "detect_every": 3}, "--no-detect excludes"),
         ({"detect": False, "weights": Path("w")}, "--no-detect excludes"),
@@ -154,55 +158,59 @@ def test_rejected_candidates_are_told_at_verbose(
         ({"detect_every": 0}, "--detect-every is 0"),
     ],
 )
-def test_impossible_options(options: dict[str, object], said: str) -> None:
-    with pytest.raises(UsageError, match=said):
+def test_impossible_detection_options_are_refused(options: dict[str, object], message: str) -> None:
+    with pytest.raises(UsageError, match=message):
         ReplayOptions(**options)  # type: ignore[arg-type]
 
 
-@pytest.mark.parametrize(("content", "said"), [(b"junk", "no ONNX network"), (b"PK\x03\x04", "pickle")])
-def test_weights_that_cannot_be_used(
-    noisy_session: Session, in_tmp: Path, capsys: pytest.CaptureFixture[str], content: bytes, said: str
+@pytest.mark.parametrize(("content", "message"), [(b"junk", "no ONNX network"), (b"PK\x03\x04", "pickle")])
+def test_unusable_weights_are_refused_in_one_line(
+    noisy_session: Session, in_tmp: Path, capsys: pytest.CaptureFixture[str], content: bytes, message: str
 ) -> None:
     Path("w.onnx").write_bytes(content)
     assert console.run(cli.app, "prim-replay", [str(noisy_session.path), "--weights", "w.onnx"]) == 1
     error = capsys.readouterr().err
-    assert said in error and error.count("\n") == 1 and not list(Path().glob("*.rrd*"))
+    assert message in error and error.count("\n") == 1 and not list(Path().glob("*.rrd*"))
 
 
-def test_without_weights_the_table_says_so(noisy_session: Session, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_table_names_missing_weights(noisy_session: Session, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("detect.networks.weights.SHIPPED", Path("nowhere"))
     result = Pipeline(noisy_session.path, ReplayOptions()).run()
-    assert "not looked for: no weights for maps of det" in dict(table(result))["primitives"] and not result.notes
+    assert (
+        "not looked for: no weights for maps of det" in dict(summary_rows(result))["primitives"] and not result.notes
+    )
     with pytest.raises(UsageError, match="give --weights"):
         Pipeline(noisy_session.path, ReplayOptions(detect_every=3)).run()
 
 
-def test_a_map_that_is_too_large_for_the_detector(
-    noisy_session: Session, knowing: Knowing, monkeypatch: pytest.MonkeyPatch
+def test_a_map_too_large_for_the_detector_skips_detection(
+    noisy_session: Session, detector: FakeDetector, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The map itself fits: the replay goes on, and says that it does not look for primitives."""
+    """The map itself is small enough: the replay goes on, and the table gives the reason."""
     monkeypatch.setattr("mapping.grid.MAX_CELLS", 10_000)
-    monkeypatch.setattr("replay.pipeline.shipped_weights", lambda mapper: Path("w"))
+    monkeypatch.setattr("replay.detection.shipped_weights", lambda mapper: Path("w"))
     result = Pipeline(noisy_session.path, ReplayOptions(resolution=0.05)).run()
-    assert dict(table(result))["primitives"].startswith("not looked for: a map of")
+    assert dict(summary_rows(result))["primitives"].startswith("not looked for: a map of")
 
 
-def test_nothing_is_held_against_the_truth_where_poses_are_in_no_known_frame(
-    noisy_session: Session, knowing: Knowing
+def test_nothing_is_evaluated_where_poses_are_in_no_known_frame(
+    noisy_session: Session, detector: FakeDetector
 ) -> None:
-    told = report(replayed(noisy_session, standing_still=True))
-    assert told["primitives"] and told["errors"] is None and told["map"]["scores"] is None
+    report = report_json(replayed(noisy_session, standing_still=True))
+    assert report["primitives"] and report["errors"] is None and report["map"]["scores"] is None
 
 
-def test_the_gaussian_sensor_model_leaves_the_detector_its_own_map(noisy_session: Session, knowing: Knowing) -> None:
+def test_the_gaussian_sensor_model_gives_the_detector_its_own_map(
+    noisy_session: Session, detector: FakeDetector
+) -> None:
     replayed(noisy_session, mapper="prob", sensor_model="gaussian", noise_std=0.05, resolution=0.05)
-    assert knowing.seen[0].frame.resolution == 0.01
+    assert detector.seen[0].frame.resolution == 0.01
 
 
-def test_a_map_whose_place_is_unsure_makes_places_and_angles_unsure() -> None:
+def test_frame_covariance_adds_to_position_and_angle_uncertainty() -> None:
     primitive = Primitive(Kind.RECTANGLE, 3.0, -4.0, 0.2, (0.3, 0.2))
     std = {"x": 0.003, "y": 0.0, "theta": 0.0, "width": 0.001, "height": 0.002}
-    shifted = spread_by_frame(primitive, std, np.diag([0.004**2, 0.0, 0.0]))
+    shifted = add_frame_uncertainty(primitive, std, np.diag([0.004**2, 0.0, 0.0]))
     assert shifted == pytest.approx(std | {"x": 0.005})
-    turned = spread_by_frame(primitive, std, np.diag([0.0, 0.0, 0.001**2]))
+    turned = add_frame_uncertainty(primitive, std, np.diag([0.0, 0.0, 0.001**2]))
     assert turned == pytest.approx(std | {"x": 0.005, "y": 0.003, "theta": 0.001})  # 4 m and 3 m from the origin

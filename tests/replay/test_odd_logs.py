@@ -69,7 +69,7 @@ def with_ranges(*ranges: float) -> Scan:
 
 
 @pytest.mark.parametrize("ranges", [[math.nan] * 9, [math.inf] * 9, [-math.inf] * 9, []])
-def test_nothing_returned(replay: Replay, ranges: list[float]) -> None:
+def test_a_log_without_any_return_is_noted(replay: Replay, ranges: list[float]) -> None:
     code, err, report = replay(write(Path("a.mcap"), [with_ranges(*ranges)] * 3))
     assert (code, report["log"]["scans_used"]) == (0, 3)
     assert "rays returned from a surface" in err
@@ -86,7 +86,7 @@ def test_nothing_returned(replay: Replay, ranges: list[float]) -> None:
         {"angle_increment": math.inf},
     ],
 )
-def test_a_scan_with_impossible_limits_is_left_out_and_said(replay: Replay, odd: dict[str, float]) -> None:
+def test_a_scan_with_impossible_limits_is_left_out_and_noted(replay: Replay, odd: dict[str, float]) -> None:
     code, err, report = replay(write(Path("a.mcap"), [GOOD, replace(GOOD, **odd), GOOD]))
     assert (code, report["log"]["scans"], report["log"]["scans_used"]) == (0, 3, 2)
     assert "1 scan cannot be used, the first one 1" in err
@@ -94,12 +94,12 @@ def test_a_scan_with_impossible_limits_is_left_out_and_said(replay: Replay, odd:
     assert (code, "no scan on /scan can be used" in err, err.count("\n")) == (1, True, 1)
 
 
-def test_scans_whose_beams_change(replay: Replay) -> None:
+def test_scans_may_change_their_beams(replay: Replay) -> None:
     code, err, report = replay(write(Path("a.mcap"), [GOOD, with_ranges(1.0, 1.0), GOOD]))
     assert (code, err.count("\n"), report["log"]["rays"]) == (0, 1, 63 + 2 + 63)
 
 
-def test_a_scan_that_cannot_be_decoded(replay: Replay) -> None:
+def test_a_scan_that_cannot_be_decoded_is_reported(replay: Replay) -> None:
     log = write(Path("a.mcap"), [GOOD, encode_scan(GOOD)[:60], GOOD])
     code, err, _ = replay(log)
     assert (code, "message 1 of /scan cannot be decoded" in err, "--recover" in err) == (1, True, True)
@@ -108,14 +108,14 @@ def test_a_scan_that_cannot_be_decoded(replay: Replay) -> None:
     assert "note: lost: messages of /scan that cannot be decoded" in err
 
 
-def test_stamps_that_repeat_or_go_back(replay: Replay) -> None:
+def test_stamps_that_repeat_or_go_back_are_noted(replay: Replay) -> None:
     stamps = (3, 2, 2, 1)
     code, err, report = replay(write(Path("a.mcap"), [replace(GOOD, stamp=stamp * SECOND) for stamp in stamps]))
     assert "stamps go back 2 times" in err and "1 scan with the stamp of the one before" in err
     assert (code, report["log"]["scans_used"], report["log"]["duration_s"]) == (0, 4, 2.0)
 
 
-def test_true_poses_of_another_type_are_passed_over(replay: Replay) -> None:
+def test_true_poses_of_another_type_are_ignored(replay: Replay) -> None:
     fixes = [(SECOND, encode_point(SECOND, 0, 0))]
     odometry = [(stamp * SECOND, encode_odometry(stamp * SECOND, Pose2D())) for stamp in range(5)]
     log = write(
@@ -126,23 +126,23 @@ def test_true_poses_of_another_type_are_passed_over(replay: Replay) -> None:
     assert replay(log, "--pose", "truth")[0] == 1
 
 
-def test_an_empty_topic_is_said_to_be_empty(replay: Replay) -> None:
+def test_an_empty_topic_is_reported(replay: Replay) -> None:
     code, err, _ = replay(write(Path("a.mcap"), []))
     assert (code, "no messages on /scan" in err) == (1, True)
     code, err, _ = replay(write(Path("b.mcap"), [GOOD], ("/odom", ODOMETRY_TYPE, [])), "--odom-topic", "/odom")
     assert (code, "no messages on /odom" in err) == (1, True)
 
 
-def test_a_gap_between_poses_is_said(replay: Replay) -> None:
+def test_a_gap_between_poses_is_noted(replay: Replay) -> None:
     poses = [(second * SECOND, encode_odometry(second * SECOND, Pose2D())) for second in (0, 1, 9)]
     code, err, report = replay(write(Path("a.mcap"), [GOOD] * 4, ("/odom", ODOMETRY_TYPE, poses)))
     assert (code, report["log"]["scans_used"]) == (0, 4)
     assert "3 scans lie in a gap of up to 8.0 s" in err
 
 
-def test_a_world_that_is_none_is_said(replay: Replay) -> None:
+def test_an_invalid_world_is_noted(replay: Replay) -> None:
     with LogWriter(Path("a.mcap")) as log:
-        log.attach("world.json", "application/json", b"[1]", 1)
+        log.add_attachment("world.json", "application/json", b"[1]", 1)
         log.add_topic("/scan", SCAN_TYPE)
         log.write("/scan", SECOND, encode_scan(replace(GOOD, stamp=SECOND)))
     code, err, report = replay("a.mcap", "--standing-still")
@@ -150,7 +150,7 @@ def test_a_world_that_is_none_is_said(replay: Replay) -> None:
     assert "the map is not scored" in err
 
 
-def test_true_poses_without_a_world_still_judge_the_poses(replay: Replay) -> None:
+def test_true_poses_without_a_world_are_compared_with_the_poses(replay: Replay) -> None:
     from prim.log.messages import encode_pose
 
     true = [(s * SECOND, encode_pose(s * SECOND, Pose2D(0.3, 0.4, 0.0))) for s in range(5)]
@@ -176,7 +176,7 @@ def test_true_poses_without_a_world_still_judge_the_poses(replay: Replay) -> Non
     ],
     ids=str,
 )
-def test_logs_that_other_writers_make(replay: Replay, options: dict[str, Any]) -> None:
+def test_logs_of_other_writers_are_read(replay: Replay, options: dict[str, Any]) -> None:
     from mcap.writer import CompressionType
 
     if "compression" in options:
@@ -206,7 +206,7 @@ def test_other_encodings_are_named(replay: Replay, encoding: str) -> None:
     assert (code, repr(encoding) in err, err.count("\n")) == (1, True, 1)
 
 
-def test_damaged_logs_never_pass_for_whole_ones(tmp_path: Path) -> None:
+def test_damaged_logs_are_never_taken_for_intact(tmp_path: Path) -> None:
     """A bounded form of bench.fuzz, with other seeds each in their own way: cuts and flipped bytes."""
     from bench.fuzz import fuzz
 
@@ -231,15 +231,17 @@ def write_chunks(path: Path, *chunks: tuple[int, ...], uncounted: int = 0) -> Pa
 
 
 @pytest.mark.parametrize("chunks", [((1, 5, 3), (4, 2, 6)), ((2, 3, 1), (6, 4, 5)), ((4, 5, 6), (1, 2, 3))])
-def test_messages_come_in_the_order_of_their_times(tmp_path: Path, chunks: tuple[tuple[int, ...], ...]) -> None:
+def test_messages_are_read_in_the_order_of_their_log_times(
+    tmp_path: Path, chunks: tuple[tuple[int, ...], ...]
+) -> None:
     """Chunks whose times interleave, chunks that are not sorted in themselves, chunks in the other order."""
-    from prim.log.mcap import LogReader
+    from prim.log import open_log
 
-    with LogReader(write_chunks(tmp_path / "a.mcap", *chunks)) as log:
+    with open_log(write_chunks(tmp_path / "a.mcap", *chunks)) as log:
         assert [message.log_time // SECOND for message in log.messages("/scan")] == [1, 2, 3, 4, 5, 6]
 
 
-def test_messages_that_the_summary_counts_and_the_log_lacks(replay: Replay) -> None:
+def test_messages_counted_in_the_summary_but_missing_are_reported(replay: Replay) -> None:
     log = write_chunks(Path("a.mcap"), (1, 2, 3), uncounted=2)
     code, err, _ = replay(log, "--standing-still")
     assert (code, "3 messages where the summary counts 5" in err) == (1, True)

@@ -1,4 +1,4 @@
-"""The pipeline as a library: lasers that hang upside down, truth that moves, the same result every time."""
+"""The pipeline as a library: lasers mounted upside down, truth that moves, repeatable results."""
 
 import json
 import time
@@ -24,20 +24,21 @@ from prim.world import World
 from recorder.sensors import Lidar
 from recorder.session import Session
 from replay.options import ReplayOptions
-from replay.pipeline import Clock, Pipeline
+from replay.pipeline import Pipeline
 from replay.result import ReplayResult
+from replay.timing import StageTimer
 from tests.replay.poses.test_localize import raw_transform
 
 STAMP = 5 * 10**9
 POSE = Pose2D(0.2, -0.1, 0.7)
-WORLD = World((2.0, 2.0), (Primitive(Kind.TRIANGLE, 0.5, 0.4, 1.0, (0.2, 0.3)),)).walled()
+WORLD = World((2.0, 2.0), (Primitive(Kind.TRIANGLE, 0.5, 0.4, 1.0, (0.2, 0.3)),)).with_walls()
 
 
 def write(path: Path, rolled: bool) -> Path:
-    """A session of one scan; the beams of a laser that hangs upside down come in the other order."""
+    """Write a session of one scan; a laser mounted upside down has its beams in the other order."""
     scan = Lidar(noise_std=0.0).measure(WORLD, POSE, STAMP, 0.1, np.random.default_rng(0))
     with LogWriter(path) as log:
-        log.attach("world.json", "application/json", json.dumps(WORLD.to_json()).encode(), STAMP)
+        log.add_attachment("world.json", "application/json", json.dumps(WORLD.to_json()).encode(), STAMP)
         log.add_topic("/scan", SCAN_TYPE)
         log.add_topic("/ground_truth/pose", POSE_TYPE)
         raw_transform("base_link", "laser", (1.0, 0.0, 0.0, 0.0) if rolled else (0.0, 0.0, 0.0, 1.0))(log)
@@ -47,7 +48,7 @@ def write(path: Path, rolled: bool) -> Path:
 
 
 @pytest.mark.parametrize("mapper", ["det", "prob"])
-def test_a_laser_that_hangs_upside_down_maps_the_same(tmp_path: Path, mapper: str) -> None:
+def test_a_laser_mounted_upside_down_gives_the_same_map(tmp_path: Path, mapper: str) -> None:
     upright, rolled = (
         Pipeline(write(tmp_path / f"{rolled}.mcap", rolled), ReplayOptions(mapper=mapper)).run()
         for rolled in (False, True)
@@ -57,11 +58,11 @@ def test_a_laser_that_hangs_upside_down_maps_the_same(tmp_path: Path, mapper: st
     assert rolled.scores.occupied_recall is not None and rolled.scores.occupied_recall > 0.95
 
 
-def test_truth_that_moves_is_followed(tmp_path: Path) -> None:
-    """The triangle is logged elsewhere before the second scan: what det marks there is right."""
+def test_maps_are_scored_against_moving_truth(tmp_path: Path) -> None:
+    """The triangle is logged elsewhere before the second scan: cells that det marks there are correct."""
     moved = replace(WORLD, primitives=(replace(WORLD.primitives[0], x=-0.5),))
     with LogWriter(tmp_path / "a.mcap") as log:
-        log.attach("world.json", "application/json", json.dumps(WORLD.to_json()).encode(), STAMP)
+        log.add_attachment("world.json", "application/json", json.dumps(WORLD.to_json()).encode(), STAMP)
         for topic, kind in (
             ("/scan", SCAN_TYPE),
             ("/ground_truth/pose", POSE_TYPE),
@@ -78,7 +79,7 @@ def test_truth_that_moves_is_followed(tmp_path: Path) -> None:
     result = Pipeline(tmp_path / "a.mcap", ReplayOptions(mapper="det")).run()
     assert result.scores is not None
     assert result.scores.occupied_precision == 1
-    marked = result.grid.centres(result.grid.occupied)
+    marked = result.grid.frame.centres(result.grid.occupied)
     assert np.count_nonzero(np.hypot(marked[:, 0] + 0.5, marked[:, 1] - 0.4) < 0.25) > 10
 
 
@@ -91,17 +92,17 @@ def test_a_replay_can_be_repeated(noisy_session: Session) -> None:
     assert first.scores == second.scores
 
 
-def test_rays_that_were_not_used_are_not_counted(noisy_session: Session) -> None:
+def test_only_rays_of_used_scans_are_counted(noisy_session: Session) -> None:
     result = Pipeline(noisy_session.path, ReplayOptions()).run()
     assert result.rays == result.scans_used * 180
 
 
-def test_time_within_a_stage_counts_to_the_inner_one() -> None:
-    clock = Clock()
-    with clock.stage("refine"):
-        with clock.stage("read"):
+def test_time_of_a_nested_stage_counts_towards_the_inner_one() -> None:
+    timer = StageTimer()
+    with timer.stage("refine"):
+        with timer.stage("read"):
             time.sleep(0.02)
-        with clock.stage("read"):
+        with timer.stage("read"):
             time.sleep(0.02)
-    assert clock.seconds["read"] >= 0.04 and clock.seconds["refine"] < clock.seconds["read"] / 2
-    assert sum(clock.seconds.values()) <= clock.total()
+    assert timer.seconds["read"] >= 0.04 and timer.seconds["refine"] < timer.seconds["read"] / 2
+    assert sum(timer.seconds.values()) <= timer.total()

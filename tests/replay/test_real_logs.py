@@ -22,7 +22,7 @@ every = pytest.mark.parametrize("mapper", MAPPERS)
 
 
 def fit_circle(points: FloatArray) -> tuple[float, float, float]:
-    """Least squares: x, y, radius."""
+    """Fit a circle by least squares; return x, y, radius."""
     x, y = points.T
     a, b, c = np.linalg.lstsq(np.column_stack((2 * x, 2 * y, np.ones(len(x)))), x**2 + y**2, rcond=None)[0]
     return float(a), float(b), math.sqrt(c + a**2 + b**2)
@@ -37,7 +37,7 @@ def test_four_round_pillars_in_a_square_room(real_log: Find, mapper: str) -> Non
     result = pillars(real_log("pillars4.mcap"), mapper)
     assert result.poses.source == "odom"
     assert (result.scans, result.scans_used) == (341, 340)
-    points = result.grid.centres(result.grid.occupied)
+    points = result.grid.frame.centres(result.grid.occupied)
     for x in (-0.6, 0.6):
         for y in (-0.6, 0.6):
             near = points[np.hypot(points[:, 0] - x, points[:, 1] - y) < 0.3]
@@ -51,9 +51,9 @@ def test_four_round_pillars_in_a_square_room(real_log: Find, mapper: str) -> Non
 
 @every
 def test_the_rooms_four_walls(real_log: Find, mapper: str) -> None:
-    """Half of the outermost cells' median on each side stands where the wall is."""
+    """The median of the outermost cells on each side is where the wall is."""
     result = pillars(real_log("pillars4.mcap"), mapper)
-    points = result.grid.centres(result.grid.occupied)
+    points = result.grid.frame.centres(result.grid.occupied)
     walls = points[np.abs(points).max(axis=1) > 1.6]
     for axis in (0, 1):
         for side in (-1, 1):
@@ -62,14 +62,14 @@ def test_the_rooms_four_walls(real_log: Find, mapper: str) -> None:
             assert side * np.median(on_wall[:, axis]) == pytest.approx(1.86, abs=0.03)
 
 
-def test_without_the_offset_the_mount_is_asked_for(real_log: Find) -> None:
+def test_a_missing_mount_is_noted_with_its_option(real_log: Find) -> None:
     result = Pipeline(real_log("pillars4.mcap"), ReplayOptions(mapper="det")).run()
     assert any("--laser-offset" in note for note in result.notes)
 
 
 @every
-def test_the_csail_floor_plan(real_log: Find, mapper: str) -> None:
-    """The known size of the floor; corridors free, straight walls; no poses lost."""
+def test_the_floor_plan_of_csail(real_log: Find, mapper: str) -> None:
+    """The size of the floor is known, corridors are free, walls straight, and all poses are used."""
     result = Pipeline(real_log("csail.mcap"), ReplayOptions(mapper=mapper, resolution=0.05, detect=False)).run()
     assert (result.poses.source, result.poses.origin) == ("tf", "odom > laser")
     assert result.scans_used == 686
@@ -82,7 +82,7 @@ def test_the_csail_floor_plan(real_log: Find, mapper: str) -> None:
     assert 3_000 < np.count_nonzero(grid.occupied) < 30_000
 
 
-def test_csail_s_odometry_and_transforms_agree(real_log: Find) -> None:
+def test_odometry_and_transforms_of_csail_agree(real_log: Find) -> None:
     tf, odom = (
         Pipeline(real_log("csail.mcap"), ReplayOptions(resolution=0.5, pose=pose, detect=False)).run().poses.poses
         for pose in ("tf", "odom")
@@ -90,7 +90,7 @@ def test_csail_s_odometry_and_transforms_agree(real_log: Find) -> None:
     assert odom == pytest.approx(tf, abs=1e-6)
 
 
-def test_forward_tells_glass_from_walls(real_log: Find) -> None:
+def test_the_forward_map_distinguishes_a_railing_from_walls(real_log: Find) -> None:
     """The hall in the middle of the floor is seen through its railing: free, but for the railing itself."""
     result = Pipeline(real_log("csail.mcap"), ReplayOptions(mapper="forward", resolution=0.05, detect=False)).run()
     assert result.noise_std == pytest.approx(0.032, abs=0.01)
@@ -102,7 +102,7 @@ def test_forward_tells_glass_from_walls(real_log: Find) -> None:
 
 @pytest.fixture
 def failing(in_tmp: Path, capsys: pytest.CaptureFixture[str]) -> Callable[..., str]:
-    """Runs prim-replay, which must fail with one line and leave nothing."""
+    """Run prim-replay, which must fail with one line and write nothing."""
 
     def run(*arguments: object) -> str:
         assert console.run(app, "prim-replay", [str(argument) for argument in arguments]) == 1
@@ -114,7 +114,7 @@ def failing(in_tmp: Path, capsys: pytest.CaptureFixture[str]) -> Callable[..., s
     return run
 
 
-def test_two_scanners_and_no_poses(real_log: Find, failing: Callable[..., str]) -> None:
+def test_two_scanners_without_poses_are_refused(real_log: Find, failing: Callable[..., str]) -> None:
     path = real_log("hokuyo_two_scanners.mcap")
     both_topics = failing(path)
     assert "/front_scan, /rear_scan" in both_topics and "--scan-topic" in both_topics
@@ -123,7 +123,7 @@ def test_two_scanners_and_no_poses(real_log: Find, failing: Callable[..., str]) 
 
 
 @every
-def test_a_scanner_that_stands_still(real_log: Find, in_tmp: Path, mapper: str) -> None:
+def test_a_scanner_that_stands_still_is_mapped(real_log: Find, in_tmp: Path, mapper: str) -> None:
     path = real_log("hokuyo_two_scanners.mcap")
     arguments = [str(path), "--scan-topic", "/front_scan", "--standing-still", "--mapper", mapper, "--quiet"]
     assert console.run(app, "prim-replay", arguments) == 0
@@ -144,7 +144,7 @@ def test_a_scanner_that_stands_still(real_log: Find, in_tmp: Path, mapper: str) 
         ("no_scan_marker.mcap", ["/cube/test (visualization_msgs/msg/Marker)"]),
     ],
 )
-def test_logs_without_scans_list_what_is_there(
+def test_logs_without_scans_are_refused_with_their_topics(
     real_log: Find, failing: Callable[..., str], name: str, listed: list[str]
 ) -> None:
     error = failing(real_log(name))

@@ -1,4 +1,4 @@
-"""What the recording holds, read back; and a picture of it, where this machine can render one."""
+"""The recording, read back; and a picture of it, where this machine can render one."""
 
 import math
 import os
@@ -13,7 +13,7 @@ import pytest
 import rerun as rr
 
 from mapping.grid import OccupancyGrid
-from prim.log.mcap import LogReader
+from prim.log import open_log
 from prim.log.messages import SCAN_TOPIC, decode_scan
 from prim.se2 import Pose2D
 from recorder.session import Session
@@ -55,7 +55,7 @@ def recording(noisy_session: Session, tmp_path_factory: pytest.TempPathFactory) 
     return path, replayed(noisy_session.path, path, mapper="prob", map_every=5)
 
 
-def test_both_timelines_and_no_other(recording: tuple[Path, ReplayResult]) -> None:
+def test_the_recording_has_exactly_two_timelines(recording: tuple[Path, ReplayResult]) -> None:
     path, result = recording
     scans = timed(rows_of(path)["/map/scan"])
     assert [row["scan"] for row in scans] == list(range(result.scans))
@@ -64,9 +64,9 @@ def test_both_timelines_and_no_other(recording: tuple[Path, ReplayResult]) -> No
     assert not any("log_time" in row or "log_tick" in row for rows in rows_of(path).values() for row in rows)
 
 
-def test_scans_are_drawn_where_they_hit(recording: tuple[Path, ReplayResult], noisy_session: Session) -> None:
+def test_scans_are_drawn_at_their_end_points(recording: tuple[Path, ReplayResult], noisy_session: Session) -> None:
     path, result = recording
-    with LogReader(noisy_session.path) as log:
+    with open_log(noisy_session.path) as log:
         scans = [scan for _, scan in log.decoded(log.topics[SCAN_TOPIC], decode_scan)]
     for row in timed(rows_of(path)["/map/scan"])[::7]:
         points = np.array(value(row, "positions"))[:, :2]
@@ -94,7 +94,7 @@ def expected_values(grid: OccupancyGrid) -> np.ndarray:
     return np.where(grid.probability == 0.5, 255, np.rint(grid.probability * 100))
 
 
-def test_scores_over_time_end_at_the_reports(recording: tuple[Path, ReplayResult]) -> None:
+def test_the_last_scores_are_those_of_the_result(recording: tuple[Path, ReplayResult]) -> None:
     path, result = recording
     last = timed(rows_of(path)["/scores"])[-1]
     assert result.scores is not None
@@ -105,7 +105,7 @@ def test_scores_over_time_end_at_the_reports(recording: tuple[Path, ReplayResult
     assert value(last, "scalars") == pytest.approx(expected)
 
 
-def test_truth_events_and_summary_are_there(recording: tuple[Path, ReplayResult], noisy_session: Session) -> None:
+def test_truth_events_and_summary_are_recorded(recording: tuple[Path, ReplayResult], noisy_session: Session) -> None:
     rows = rows_of(recording[0])
     outlines = value(rows["/map/truth/primitives"][0], "strips")
     assert len(outlines) == len(noisy_session.world.primitives)
@@ -118,7 +118,7 @@ def test_truth_events_and_summary_are_there(recording: tuple[Path, ReplayResult]
     assert rows["/timing"]
 
 
-def test_a_blueprint_is_saved_with_it(recording: tuple[Path, ReplayResult]) -> None:
+def test_a_blueprint_is_saved_with_the_recording(recording: tuple[Path, ReplayResult]) -> None:
     printed = subprocess.run([RERUN, "rrd", "print", recording[0]], capture_output=True, text=True, check=True)
     assert "Blueprint" in printed.stdout
 
@@ -127,15 +127,15 @@ def test_pose_errors_are_drawn_where_poses_are_compared(noisy_session: Session, 
     result = replayed(noisy_session.path, tmp_path / "a.rrd", pose="odom")
     errors = timed(rows_of(tmp_path / "a.rrd")["/pose_error/position"])
     assert len(errors) == result.scans
-    error, told = value(errors[-1], "scalars")
-    assert error == pytest.approx(0, abs=1e-6) and math.isnan(told)
+    error, std = value(errors[-1], "scalars")
+    assert error == pytest.approx(0, abs=1e-6) and math.isnan(std)
 
 
-def test_fused_poses_are_drawn_with_how_sure_they_are(noisy_session: Session, tmp_path: Path) -> None:
+def test_fused_poses_are_drawn_with_their_uncertainty(noisy_session: Session, tmp_path: Path) -> None:
     result = replayed(noisy_session.path, tmp_path / "a.rrd", pose="fused")
     rows = rows_of(tmp_path / "a.rrd")
-    error, told = value(timed(rows["/pose_error/position"])[-1], "scalars")
-    assert 0 <= error < 5 * told
+    error, std = value(timed(rows["/pose_error/position"])[-1], "scalars")
+    assert 0 <= error < 5 * std
     ellipses = timed(rows["/map/laser_95_percent"])
     assert len(ellipses) == result.scans
     ring = np.array(value(ellipses[-1], "strips")[0])[:, :2]
@@ -146,7 +146,7 @@ def test_fused_poses_are_drawn_with_how_sure_they_are(noisy_session: Session, tm
     assert squared == pytest.approx(5.991, rel=1e-2)  # two degrees of freedom: 95 %
 
 
-def test_a_selection_and_a_rate(noisy_session: Session, tmp_path: Path) -> None:
+def test_a_paced_selection_is_drawn_completely(noisy_session: Session, tmp_path: Path) -> None:
     viewer = RerunViewer(ViewerOptions(save=tmp_path / "a.rrd", live=True), announce=print)
     Pipeline(noisy_session.path, ReplayOptions(selection=Selection(n_scans=4), rate=100.0), viewer).run()
     assert len(timed(rows_of(tmp_path / "a.rrd")["/map/scan"])) == 4
@@ -161,7 +161,7 @@ def can_render() -> bool:
 
 
 @pytest.mark.skipif(not can_render(), reason="no Vulkan driver here to render with (mesa-vulkan-drivers)")
-def test_the_viewer_draws_it_without_complaint(recording: tuple[Path, ReplayResult], tmp_path: Path) -> None:
+def test_the_viewer_draws_every_view(recording: tuple[Path, ReplayResult], tmp_path: Path) -> None:
     picture = tmp_path / "a.png"
     done = subprocess.run(
         [sys.executable, SCREENSHOT, recording[0], picture], capture_output=True, text=True, check=False, timeout=120
@@ -171,8 +171,8 @@ def test_the_viewer_draws_it_without_complaint(recording: tuple[Path, ReplayResu
     assert picture.stat().st_size > 30_000
 
 
-def test_a_log_of_ours_opens_in_reruns_own_importer(noisy_session: Session, tmp_path: Path) -> None:
-    """Its importer draws the poses and the transforms of a ROS 2 log; a log it cannot read leaves nothing."""
+def test_recorded_logs_open_in_the_importer_of_rerun(noisy_session: Session, tmp_path: Path) -> None:
+    """The importer draws the poses and the transforms of a ROS 2 log; one it cannot read leaves nothing."""
     converted = tmp_path / "a.rrd"
     subprocess.run(
         [RERUN, "mcap", "convert", noisy_session.path, "-o", converted], capture_output=True, check=True, timeout=60

@@ -1,0 +1,187 @@
+"""The map of a replay: its frame, its mapper, and the stage that adds scan after scan."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+
+from mapping.forward.mapper import estimate_noise
+from mapping.grid import GridFrame, OccupancyGrid
+from mapping.kernels import hit_extent, scan_arrays
+from mapping.mapper import Mapper, make_mapper
+from prim.errors import LogReadError
+from prim.scan import PosedScan, Scan
+from prim.se2 import Pose2D
+from prim.world import World
+from replay.options import ReplayOptions
+from replay.posed_scans import PosedScans
+from replay.timing import StageTimer
+
+WORLD_MARGIN = 0.1
+"""Automatic bounds reach this far (m) beyond the recorded world (DESIGN, section 5)."""
+
+NOISE_SCANS = 200
+"""Where only the range noise is wanted, it is estimated from about this many scans, evenly spread; set by hand."""
+
+
+@dataclass
+class Usage:
+    """How much of a log went into the map.
+
+    Attributes:
+        scans: The number of scans.
+        rays: The number of rays.
+        hits: The number of rays that returned from a surface.
+    """
+
+    scans: int = 0
+    rays: int = 0
+    hits: int = 0
+
+    def count(self, scan: Scan) -> None:
+        """Count a scan."""
+        self.scans += 1
+        self.rays += len(scan.ranges)
+        self.hits += int(np.count_nonzero(scan.measured))
+
+
+class MappingStage:
+    """Makes the map of a replay, scan by scan.
+
+    Args:
+        mapper: The mapper.
+        snapshot_interval: A snapshot of the map is wanted every so many scans; None for no snapshots.
+        streaming: Whether the map is needed before the last scan, by the viewer or by the detector.
+        timer: Counts the time towards the stage «map».
+
+    Attributes:
+        mapper: The mapper.
+        usage: What went into the map so far.
+    """
+
+    def __init__(self, mapper: Mapper, snapshot_interval: int | None, streaming: bool, timer: StageTimer) -> None:
+        self.mapper = mapper
+        self.usage = Usage()
+        self._snapshot_interval = snapshot_interval
+        self._add = mapper.update if streaming else mapper.accumulate
+        self._timer = timer
+
+    def update(self, posed: PosedScan) -> float:
+        """Add a scan to the map; return the time that it took (s)."""
+        start = time.perf_counter()
+        with self._timer.stage("map"):
+            for scan, pose in posed.pieces:
+                self._add(scan, pose)
+        elapsed = time.perf_counter() - start
+        self.usage.count(posed.scan)
+        return elapsed
+
+    def snapshot(self, position: int) -> OccupancyGrid | None:
+        """Return the map so far where a snapshot is due after the scan at ``position``; else None."""
+        if not self._snapshot_interval or position % self._snapshot_interval:
+            return None
+        with self._timer.stage("map"):
+            return self.mapper.grid()
+
+    def finish(self) -> OccupancyGrid:
+        """Return the map of all scans."""
+        with self._timer.stage("map"):
+            return self.mapper.finish()
+
+    def notes(self, grid: OccupancyGrid) -> list[str]:
+        """Return what a user should know where the final map ``grid`` shows nothing."""
+        if not self.usage.hits:
+            return [f"none of {self.usage.rays} rays returned from a surface: nothing is occupied"]
+        if not (grid.free | grid.occupied).any():
+            return ["no ray crosses the map's bounds: all of it is unknown"]
+        return []
+
+
+def choose_frame(posed_scans: PosedScans, options: ReplayOptions, world: World | None) -> GridFrame:
+    """Choose the map's frame: the bounds that are given, else the recorded world's, else those of all end points.
+
+    Args:
+        posed_scans: The scans to be mapped.
+        options: The resolution and, where they are given, the bounds.
+        world: The recorded world; None where it is not known.
+
+    Returns:
+        The smallest frame of whole cells that covers the bounds.
+
+    Raises:
+        LogReadError: The bounds follow from the end points, and no usable scan has a pose.
+    """
+    if options.bounds is not None:
+        return GridFrame.covering(options.bounds, options.resolution)
+    if world is not None:
+        return frame_of_world(world, options.resolution)
+    frame = frame_of_end_points((piece for posed in posed_scans for piece in posed.pieces), options.resolution)
+    if frame is None:
+        path = posed_scans.scan_log.path
+        raise LogReadError(path, "no scan that can be used has a pose", "give another --pose")
+    return frame
+
+
+def frame_of_world(world: World, resolution: float) -> GridFrame:
+    """Compute the frame that a recorded world is mapped in.
+
+    Args:
+        world: The world.
+        resolution: Side of a cell (m).
+
+    Returns:
+        The smallest frame of whole cells that covers the world and a margin of WORLD_MARGIN.
+    """
+    x0, y0, x1, y1 = world.bounds
+    m = WORLD_MARGIN
+    return GridFrame.covering((x0 - m, y0 - m, x1 + m, y1 + m), resolution)
+
+
+def frame_of_end_points(scans: Iterable[tuple[Scan, Pose2D]], resolution: float) -> GridFrame | None:
+    """Compute the frame of the end points of all beams.
+
+    Args:
+        scans: Scans, or pieces of them, with the laser's poses.
+        resolution: Side of a cell (m).
+
+    Returns:
+        The smallest frame that holds them; None without scans.
+    """
+    extents = [hit_extent(scan_arrays(scan, pose), 1 / resolution) for scan, pose in scans]
+    if not extents:
+        return None
+    row, col = np.min([extent[:2] for extent in extents], axis=0).tolist()
+    last_row, last_col = np.max([extent[2:] for extent in extents], axis=0).tolist()
+    return GridFrame(resolution, row, col, last_row - row + 1, last_col - col + 1)
+
+
+def make_replay_mapper(
+    posed_scans: PosedScans, frame: GridFrame, options: ReplayOptions, timer: StageTimer
+) -> Mapper:
+    """Make the mapper that the options name; estimate the range noise first where it needs that and lacks it.
+
+    Args:
+        posed_scans: The scans to be mapped.
+        frame: The map's frame.
+        options: Mapper, sensor model, resolution and range noise.
+        timer: Counts the time of estimating the noise towards the stage «map».
+
+    Returns:
+        The mapper, without a scan yet.
+
+    Raises:
+        LogReadError: The range noise is needed, and there are too few ranges to estimate it.
+    """
+    noise_std = options.noise_std
+    if options.sensor_model == "gaussian" and noise_std is None:
+        every = -(-len(posed_scans.scan_log) // NOISE_SCANS)
+        pieces = [piece for posed in posed_scans if posed.position % every == 0 for piece in posed.pieces]
+        with timer.stage("map"):
+            noise_std = estimate_noise(pieces, frame)
+        if noise_std is None:
+            what = "too few ranges to find the noise for the Gaussian sensor model"
+            raise LogReadError(posed_scans.scan_log.path, what, "give it: --noise-std")
+    return make_mapper(options.mapper, options.resolution, frame.bounds, options.sensor_model, noise_std)

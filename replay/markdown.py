@@ -1,0 +1,49 @@
+"""The viewer's tables as Markdown text."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+
+from replay.detection import DetectionResult
+from replay.report import summary_rows
+from replay.result import ReplayResult
+
+
+def summary_markdown(result: ReplayResult) -> str:
+    """Return the table that ends a replay."""
+    rows = "\n".join(f"| **{name}** | {value} |" for name, value in summary_rows(result))
+    return f"| | |\n|---|---|\n{rows}\n"
+
+
+def detections_markdown(result: DetectionResult) -> str:
+    """Return a table of the detected primitives: lengths in millimetres, angles in degrees."""
+    lines = ["| id | kind | score | x, mm | y, mm | angle | size, mm | ± 1σ: mm, ° |", "|" + "---|" * 8]
+    for identity, detection in zip(result.identities, result.detections.found, strict=True):
+        primitive = detection.primitive
+        cells = (
+            str(identity.id),
+            str(primitive.kind),
+            f"{detection.score:.2f}",
+            f"{1000 * primitive.x:.1f}",
+            f"{1000 * primitive.y:.1f}",
+            "" if primitive.theta is None else f"{math.degrees(primitive.theta):.1f}°",
+            ", ".join(f"{_words(name)} {1000 * value:.1f}" for name, value in primitive.sizes.items()),
+            _standard_deviations(detection.std or identity.std),
+        )
+        lines.append(f"| {' | '.join(cells)} |")
+    return "\n".join(lines) + "\n"
+
+
+def _standard_deviations(std: Mapping[str, float] | None) -> str:
+    """List standard deviations by name; empty where they are not known."""
+    if std is None:
+        return ""
+    return ", ".join(
+        f"angle {math.degrees(value):.2f}°" if name == "theta" else f"{_words(name)} {1000 * value:.2f}"
+        for name, value in std.items()
+    )
+
+
+def _words(name: str) -> str:
+    return name.replace("_", " ")
