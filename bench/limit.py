@@ -23,9 +23,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from detect.refinement.fit import TIES
-from detect.refinement.kernels import trace
-from detect.refinement.rays import FAMILY, Beams, gather, parameters
+from detect.refinement.geometry import TIES, parameters_of, ranges_to, shape_ranges
+from detect.refinement.rays import RayBundle, collect_rays
 from prim.arrays import FloatArray
 from prim.raycast import cast_segments
 from prim.scan import Scan
@@ -58,26 +57,25 @@ def bounds(
     noise_std: float,
 ) -> list[Limits]:
     """The bounds of each primitive."""
-    around, _, _ = gather(scans, primitives, REACH)
+    around, _, _ = collect_rays(scans, primitives, REACH)
     made = []
     for k, (one, beams) in enumerate(zip(primitives, around, strict=True)):
-        near = beams.of(beams.passing(one, REACH))
+        near = beams.select(beams.passing(one, REACH))
         behind = np.minimum(_nearest(near, [*primitives[:k], *primitives[k + 1 :]]), _walls(near, walls))
         scene = Scene(one, near, behind, noise_std)
         made.append(Limits(chapman_robbins(scene), weiss_weinstein(scene)))
     return made
 
 
-def _nearest(beams: Beams, others: Sequence[Primitive]) -> FloatArray:
-    nearest, distance = np.full(len(beams), np.inf), np.empty(len(beams))
+def _nearest(beams: RayBundle, others: Sequence[Primitive]) -> FloatArray:
+    nearest = np.full(len(beams), np.inf)
     for other in others:
-        trace(FAMILY[other.kind], parameters(other), beams.rays, distance)
-        np.minimum(nearest, distance, out=nearest)
+        np.minimum(nearest, ranges_to(other, beams.rays), out=nearest)
     return nearest
 
 
-def _walls(beams: Beams, walls: FloatArray) -> FloatArray:
-    distance = beams.far.copy()
+def _walls(beams: RayBundle, walls: FloatArray) -> FloatArray:
+    distance = beams.max_range.copy()
     origins, scan = np.unique(beams.rays[:2], axis=1, return_inverse=True)
     for number, origin in enumerate(origins.T.tolist()):
         own = np.flatnonzero(scan.ravel() == number)
@@ -91,20 +89,18 @@ class Scene:
     """A primitive, the rays that pass it, where (m) they end without it, and their noise (m)."""
 
     primitive: Primitive
-    beams: Beams
+    beams: RayBundle
     behind: FloatArray
     noise_std: float
 
     @property
     def tie(self) -> FloatArray:
-        """(5, K): see detect.refinement.fit.TIES."""
+        """(5, K): see detect.refinement.geometry.TIES."""
         return TIES[self.primitive.kind]
 
     def ranges(self, at: FloatArray) -> FloatArray:
         """Exact ranges (N,) with the primitive's parameters ``at`` (5,)."""
-        distance = np.empty(len(self.beams))
-        trace(FAMILY[self.primitive.kind], at, self.beams.rays, distance)
-        return np.minimum(distance, self.behind)
+        return np.minimum(shape_ranges(self.primitive.kind, at, self.beams.rays), self.behind)
 
     def steps(self, step: float) -> FloatArray:
         """A step of each of the own parameters, as five parameters: (K, 5)."""
@@ -113,7 +109,7 @@ class Scene:
 
 def chapman_robbins(scene: Scene) -> FloatArray:
     """The bound (K,) of Chapman and Robbins."""
-    p = parameters(scene.primitive)
+    p = parameters_of(scene.primitive)
     here = scene.ranges(p)
     best = np.zeros(scene.tie.shape[1])
     for step in (sign * size for size in STEPS for sign in (-1.0, 1.0)):
@@ -129,7 +125,7 @@ def weiss_weinstein(scene: Scene) -> FloatArray:
     """The bound (K,) of Weiss and Weinstein, over parameters within JITTER of the true ones."""
     rng = np.random.default_rng(0)
     size = scene.tie.shape[1]
-    around = parameters(scene.primitive) + rng.uniform(-JITTER, JITTER, (PLACES, size)) @ scene.steps(1.0)
+    around = parameters_of(scene.primitive) + rng.uniform(-JITTER, JITTER, (PLACES, size)) @ scene.steps(1.0)
     best = np.zeros(size)
     for step in STEPS:
         moves = scene.steps(step)

@@ -1,4 +1,4 @@
-"""Candidates: the things that refinement fits, each beside what is known of the others."""
+"""Candidates: what is fitted, each with its rays and beside the others, which may occlude it."""
 
 from __future__ import annotations
 
@@ -11,154 +11,223 @@ import numpy as np
 from numpy.typing import NDArray
 
 from detect.detection import Detection
-from detect.refinement.evidence import laplace, longest
-from detect.refinement.fit import SIMPLER, TIES, Fit, again, again_alone, primitive_of, search
+from detect.refinement.evidence import laplace_evidence, max_size
+from detect.refinement.fit import SPECIAL_CASES, KindFit, fit_all_kinds, refit, refit_same_kind
+from detect.refinement.geometry import TIES, parameters_of, primitive_of
 from detect.refinement.map_cells import MapCells
-from detect.refinement.rays import Backdrop, Beams, Obstacles, Sensor, backdrop, before, map_says, parameters
+from detect.refinement.options import DEFAULTS, RefinementOptions
+from detect.refinement.rays import RayBundle
+from detect.refinement.sensor_model import (
+    Background,
+    BeamModel,
+    ClearanceMap,
+    background_log_likelihood,
+    with_background,
+)
 from detect.refinement.walls import Wall, walls_behind
 from prim.arrays import FloatArray
 from prim.metrics import polygon_areas
 from prim.shapes import Primitive
 
-WITHIN = 2.5
-"""Others further away than this (m) are not reckoned with: few rays pass both, and say the same of all shapes."""
-
-OUT_OF_QUESTION = 30.0
-"""A kind whose evidence is this much (nats) less than the likeliest one's is not fitted again; with rays that are not
-independent, so much times their dispersion.
-"""
-
-MOVED, MOVED_SHARE = 0.05, 0.1
-"""What stands behind has changed where more than such a share of rays ends elsewhere (m): all is fitted anew."""
-
-SAME_NOISE = 0.03
-"""Noise that differs by less than this share is the same: nothing is fitted again for it."""
-
 
 @dataclass
 class Candidate:
-    """One thing that is fitted: where it was first seen, the rays around it, and what is known of it by ``now``.
+    """One thing that is fitted.
 
-    Its fits are ``rough`` where they were made to some of the rays only.
+    Attributes:
+        start: the guess.
+        bundle: the rays around it.
+        cells: the map.
+        known: a detection of an earlier pass whose kind is not asked again.
+        options: the numbers of refinement.
+        background: what stands behind it in the map.
+        walls: straight walls near it.
+        fits: the fits, likeliest kind first.
+        fitted_to: the sensor and the rays, with their background, of these fits.
+        is_rough: whether they were made to some of the rays only.
+        current: the primitive as far as it is known.
     """
 
     start: Primitive
-    beams: Beams
+    bundle: RayBundle
     cells: MapCells
     known: Detection | None = None
-    map_behind: Backdrop | None = None
+    options: RefinementOptions = DEFAULTS
+    background: Background | None = None
     walls: list[Wall] = field(default_factory=list)
-    fits: list[Fit] = field(default_factory=list)
-    fitted_to: tuple[Sensor, Beams] | None = None
-    said: tuple[Backdrop, float, FloatArray] | None = None
-    rough: bool = False
-    now: Primitive = field(init=False)
+    fits: list[KindFit] = field(default_factory=list)
+    fitted_to: tuple[BeamModel, RayBundle] | None = None
+    is_rough: bool = False
+    current: Primitive = field(init=False)
+    _cached: tuple[Background, float, FloatArray] | None = None
 
     def __post_init__(self) -> None:
-        self.now = self.start
+        self.current = self.start
 
-    def seen_before(self, others: Sequence[Candidate], sensor: Sensor) -> Beams:
-        """Its beams, with what they say where they miss it: of the map, of walls, and of the other candidates."""
-        behind = self.map_behind
-        assert behind is not None
-        if self.said is None or self.said[0] is not behind or self.said[1] != sensor.std:
-            self.said = behind, sensor.std, map_says(self.beams, behind, sensor)
-        shapes = [one.now for one in others if one is not self and apart(one.start, self.start) < WITHIN]
-        return before(self.beams, behind, self.said[2], [*shapes, *(wall.stretch for wall in self.walls)], sensor)
+    def rays_with_background(self, others: Sequence[Candidate], sensor: BeamModel) -> RayBundle:
+        """Set what its rays measure where they miss it: the map, walls and other candidates.
 
-    def look_at(self, chosen: NDArray[np.bool_]) -> None:
-        """Leaves out all other beams."""
-        self.beams = self.beams.of(chosen)
-        self.map_behind = self.map_behind and self.map_behind.of(chosen)
-        self.fitted_to = self.fitted_to and (self.fitted_to[0], self.fitted_to[1].of(chosen))
+        Args:
+            others: all candidates; those far away, and itself, are passed over.
+            sensor: the sensor.
+
+        Returns:
+            Its rays.
+        """
+        background = self.background
+        assert background is not None
+        if self._cached is None or self._cached[0] is not background or self._cached[1] != sensor.std:
+            self._cached = background, sensor.std, background_log_likelihood(self.bundle, background, sensor)
+        reach = self.options.map.occluder_distance
+        near = [
+            other.current
+            for other in others
+            if other is not self and centroid_distance(other.start, self.start) < reach
+        ]
+        occluders = [*near, *(wall.stretch for wall in self.walls)]
+        return with_background(self.bundle, background, self._cached[2], occluders, sensor)
+
+    def keep_rays(self, chosen: NDArray[np.bool_]) -> None:
+        """Leave out all rays but the chosen ones (N,)."""
+        self.bundle = self.bundle.select(chosen)
+        self.background = self.background and self.background.select(chosen)
+        self.fitted_to = self.fitted_to and (self.fitted_to[0], self.fitted_to[1].select(chosen))
 
     @property
-    def known_fit(self) -> Fit:
-        """The best fit of the kind that it is known to be, or where that begins."""
+    def known_fit(self) -> KindFit:
+        """The best fit of the kind that it is known to be, or a start of it."""
         if self.fits:
             return self.fits[0]
         kind = self.start.kind
-        return Fit(kind, parameters(self.start), 0.0, np.eye(TIES[kind].shape[1]))
+        return KindFit(kind, parameters_of(self.start), 0.0, np.eye(TIES[kind].shape[1]))
 
-    def may_be(self, primitive: Primitive) -> bool:
-        """Whether a primitive keeps off the walls behind it, and is no larger than primitives are."""
-        if max(parameters(primitive)[3:]) >= longest(primitive.kind):
+    def is_possible(self, primitive: Primitive) -> bool:
+        """Tell whether a primitive in its place keeps off walls and is no larger than the prior allows."""
+        if max(parameters_of(primitive)[3:]) >= max_size(primitive.kind, self.options.evidence):
             return False
         own = (wall for wall in self.walls if wall.behind is self.start)
-        return not self.cells.is_pierced_by(primitive) and not any(wall.is_cut_by(primitive) for wall in own)
+        depth = self.options.walls.depth
+        return not self.cells.is_behind_wall(primitive) and not any(wall.is_cut_by(primitive, depth) for wall in own)
 
-    def take(self, fits: list[Fit], to: Beams, by: Sensor) -> None:
-        """Holds these fits to some beams for what is known of it, the first of them for the best."""
-        self.fits, self.fitted_to = fits, (by, to)
-        self.now = primitive_of(fits[0].kind, fits[0].p)
+    def set_fits(self, fits: list[KindFit], bundle: RayBundle, sensor: BeamModel) -> None:
+        """Take fits for what is known of it.
+
+        Args:
+            fits: the fits, the likeliest kind first.
+            bundle: the rays that they were made to.
+            sensor: the sensor that they were made with.
+        """
+        self.fits, self.fitted_to = fits, (sensor, bundle)
+        self.current = primitive_of(fits[0].kind, fits[0].p)
 
 
-def fit_all(pool: Executor, candidates: Sequence[Candidate], anew: Sequence[bool], sensor: Sensor) -> None:
-    """Fits all candidates beside what was known of the others before: ``anew``, or from where they are.
+def fit_candidates(
+    pool: Executor, candidates: Sequence[Candidate], search: Sequence[bool], sensor: BeamModel
+) -> None:
+    """Fit all candidates in parallel, each beside what was known of the others before.
 
-    Where hardly anything has changed behind and before a candidate, it stays as it is.
+    A candidate whose background and occlusion have hardly changed stays as it is.
+
+    Args:
+        pool: the threads.
+        candidates: the candidates.
+        search: for each whether all kinds are fitted from new starts, or from the fits that there are.
+        sensor: the sensor.
     """
-    beams = [one.seen_before(candidates, sensor) for one in candidates]
-    list(pool.map(lambda one, own, new: _fit_one(one, own, sensor, new), candidates, beams, anew))
+    bundles = [candidate.rays_with_background(candidates, sensor) for candidate in candidates]
+    work = zip(candidates, bundles, search, strict=True)
+    list(pool.map(lambda item: _fit_candidate(item[0], item[1], item[2], sensor), work))
 
 
-def _fit_one(candidate: Candidate, beams: Beams, sensor: Sensor, anew: bool) -> None:
-    """Leaves a candidate's kinds, likeliest first, as far as a Gaussian tells their evidence."""
-    before = candidate.fitted_to
-    searched = candidate.known is None and (anew or before is None)
-    if before is not None and not searched and not candidate.rough and _much_alike(before, sensor, beams):
+def _fit_candidate(candidate: Candidate, bundle: RayBundle, search: bool, sensor: BeamModel) -> None:
+    """Fit a candidate's kinds; those that are out of the question by Laplace's evidence go."""
+    earlier, options = candidate.fitted_to, candidate.options
+    searched = candidate.known is None and (search or earlier is None)
+    unchanged = earlier is not None and _is_unchanged(earlier, sensor, bundle, options)
+    if unchanged and not searched and not candidate.is_rough:
         return
-    candidate.rough = searched
+    candidate.is_rough = searched
     if searched:
-        fits = search(candidate.now, candidate.fits, beams, sensor)
+        fits = fit_all_kinds(candidate.current, candidate.fits, bundle, sensor, options.fit)
     elif candidate.known is not None:
-        fits = again_alone(candidate.known_fit, beams, sensor)
+        fits = refit_same_kind(candidate.known_fit, bundle, sensor, options.fit)
     else:
-        fits = again(candidate.fits, beams, sensor)
-    possible = [fit for fit in fits if candidate.may_be(primitive_of(fit.kind, fit.p))]
-    ordered = sorted(possible or fits, key=lambda fit: -laplace(fit))
-    least = laplace(ordered[0]) - OUT_OF_QUESTION * sensor.dispersion
-    likely = {fit.kind for fit in ordered if laplace(fit) > least}
-    likely |= {SIMPLER[kind] for kind in likely if kind in SIMPLER}
-    candidate.take([fit for fit in ordered if fit.kind in likely], beams, sensor)
+        fits = refit(candidate.fits, bundle, sensor, options.fit)
+    possible = [fit for fit in fits if candidate.is_possible(primitive_of(fit.kind, fit.p))]
+    evidence = {fit.kind: laplace_evidence(fit, options=options.evidence) for fit in possible or fits}
+    ordered = sorted(possible or fits, key=lambda fit: -evidence[fit.kind])
+    limit = evidence[ordered[0].kind] - options.evidence.out_of_question * sensor.dispersion
+    likely = {kind for kind, value in evidence.items() if value > limit}
+    likely |= {SPECIAL_CASES[kind] for kind in likely if kind in SPECIAL_CASES}
+    candidate.set_fits([fit for fit in ordered if fit.kind in likely], bundle, sensor)
 
 
-def _much_alike(before: tuple[Sensor, Beams], sensor: Sensor, beams: Beams) -> bool:
-    """Whether fits that were made to some beams before need not be made again."""
-    one, fitted_to = before
-    same = abs(one.std - sensor.std) < SAME_NOISE * sensor.std and one.footprint == sensor.footprint
-    return same and fitted_to.much_alike(beams)
+def _is_unchanged(
+    earlier: tuple[BeamModel, RayBundle], sensor: BeamModel, bundle: RayBundle, options: RefinementOptions
+) -> bool:
+    """Tell whether fits to earlier rays hold for these."""
+    before, fitted_to = earlier
+    same_noise = abs(before.std - sensor.std) < options.sensor.same_noise * sensor.std
+    return same_noise and before.footprint == sensor.footprint and fitted_to.is_similar(bundle, options)
 
 
-def look_behind(pool: Executor, candidates: Sequence[Candidate], cells: MapCells, margin: float) -> list[bool]:
-    """Reads from the map what stands behind each candidate: the map without their own cells.
+def find_backgrounds(pool: Executor, candidates: Sequence[Candidate], cells: MapCells, margin: float) -> list[bool]:
+    """Read from the map what stands behind each candidate: the map without the candidates' own cells.
 
-    Whose cells are a candidate's is better known the second time; returns for which that changed much.
+    Args:
+        pool: the threads.
+        candidates: the candidates; their background and walls are set.
+        cells: the map.
+        margin: cells this near (m) to a candidate are its own.
+
+    Returns:
+        For each candidate whether its background has changed much.
     """
-    shapes = [one.now for one in candidates]
+    shapes = [candidate.current for candidate in candidates]
     occupied = cells.without(shapes, margin)
-    walls = walls_behind(cells, shapes, [one.start for one in candidates])
+    walls = walls_behind(cells, shapes, [candidate.start for candidate in candidates])
     for wall in walls:
         occupied[wall.cells] = False
-    obstacles = Obstacles.of(occupied, cells.frame)
-    behind = pool.map(lambda one: backdrop(one.beams, obstacles), candidates)
+    clearance = ClearanceMap.of(occupied, cells.frame)
+    found = pool.map(lambda candidate: clearance.background(candidate.bundle), candidates)
     changed = []
-    for one, now in zip(candidates, behind, strict=True):
-        before, one.map_behind = one.map_behind, now
-        one.walls = [wall for wall in walls if apart(wall.stretch, one.start) < WITHIN]
-        moved = before is None or np.mean(np.abs(before.stops - now.stops) > MOVED) > MOVED_SHARE
-        changed.append(bool(moved))
+    for candidate, background in zip(candidates, found, strict=True):
+        limits = candidate.options.map
+        before, candidate.background = candidate.background, background
+        near = limits.occluder_distance
+        candidate.walls = [wall for wall in walls if centroid_distance(wall.stretch, candidate.start) < near]
+        if before is None:
+            changed.append(True)
+            continue
+        moved = np.abs(before.ranges - background.ranges) > limits.moved_range
+        changed.append(bool(np.mean(moved) > limits.moved_share))
     return changed
 
 
-def apart(a: Primitive, b: Primitive) -> float:
-    """How far (m) two primitives' middles are from each other."""
+def centroid_distance(a: Primitive, b: Primitive) -> float:
+    """Return the distance (m) of two primitives' centroids.
+
+    Args:
+        a: one.
+        b: the other.
+
+    Returns:
+        Metres.
+    """
     return math.hypot(a.x - b.x, a.y - b.y)
 
 
-def share_of(a: Primitive, b: Primitive) -> float:
-    """How much two primitives share, of the smaller one's area."""
-    if apart(a, b) > a.circumradius + b.circumradius:
+def shared_area(a: Primitive, b: Primitive) -> float:
+    """Return the area that two primitives share, as a fraction of the smaller one's.
+
+    Args:
+        a: one.
+        b: the other.
+
+    Returns:
+        0 to 1.
+    """
+    if centroid_distance(a, b) > a.circumradius + b.circumradius:
         return 0.0
     first, second, shared = polygon_areas(a, b)
     return shared / min(first, second)

@@ -1,4 +1,10 @@
-"""How likely a kind is, and how sure its parameters: the likelihood of rays, averaged over all that they allow."""
+"""Model comparison: the evidence (marginal likelihood) of kinds, and the posterior of their parameters.
+
+The evidence is the likelihood integrated over the prior: a square that explains the rays as well as a rectangle does
+is the likelier kind, since it has a size less to choose (Occam's factor; MacKay 2003, chapter 28). It is first
+approximated by Laplace's method, and for the contenders computed by adaptive importance sampling from Student's t.
+The same samples give the posterior mean and covariance.
+"""
 
 from __future__ import annotations
 
@@ -10,211 +16,273 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-from detect.refinement.fit import SIMPLER, TIES, Fit, primitive_of
-from detect.refinement.kernels import MISS, PARAMETERS, costs, margins, slopes
-from detect.refinement.rays import FAMILY, Beams, Sensor
+from detect.refinement.fit import SPECIAL_CASES, KindFit
+from detect.refinement.geometry import NUMBERS, OUTLINES, TIES, primitive_of
+from detect.refinement.kernels import (
+    BACKGROUND,
+    PARAMETERS,
+    gradient,
+    negative_log_likelihoods,
+    standardized_clearances,
+)
+from detect.refinement.options import DEFAULTS, EvidenceOptions
+from detect.refinement.rays import RayBundle
+from detect.refinement.sensor_model import BeamModel
 from prim.arrays import FloatArray
 from prim.shapes import Kind, Primitive
 
-SAME_SIZES = 0.0005
-"""Sizes that differ by less than this (m) are the same: no thing is made, and no pose known, better."""
+EXACT = 1e-9
+"""m; the blur for rays that surely hit: as good as none."""
 
-CONTENDER = 7.0
-"""Kinds whose evidence is within this (nats) of the best one's are sampled."""
-
-LONGEST = 0.7
-"""Sizes are taken to be even up to this (m), before the rays are asked."""
-
-SAMPLES = (300, 300, 600)
-DEGREES = 6.0
-"""So many samples are drawn in each round, from Student's t with so many degrees of freedom: its tails are heavy."""
-
-EFFECTIVE = 0.15
-"""In all rounds but the last, weights are made more alike until this share of the samples counts."""
-
-LEAST_EFFECTIVE = 0.06
-"""So are they in the last, until this share does: where fewer would, they would tell too small a spread."""
-
-LEAST_STD = (1e-4, 1e-4, 1e-3, 1e-4, 1e-4)
-MOST_TURN = 0.5
-"""Bounds on what samples are spread over (m, rad)."""
+POSITIVE = 1e-3
+"""m; a sample with a smaller size is no shape."""
 
 
-def longest(kind: Kind) -> float:
-    """What a kind's sizes stay below (m)."""
-    return LONGEST / kind.extent
+def max_size(kind: Kind, options: EvidenceOptions = DEFAULTS.evidence) -> float:
+    """Return the upper bound (m) of a kind's sizes under the prior.
 
+    Args:
+        kind: the kind.
+        options: the largest extent.
 
-def log_prior(kind: Kind) -> float:
-    """The logarithm of the density of a kind's parameters (but its place), before the rays are asked.
-
-    All sizes up to LONGEST and all angles are alike. A rectangle is found in one of two ways to name its sides (and
-    an ellipse its axes), each of them half of what it might be.
+    Returns:
+        The bound (m): half the extent for radii and semi-axes.
     """
-    sizes = len(kind.sizes) * math.log(kind.extent / LONGEST)
+    return options.max_extent / kind.extent
+
+
+def log_prior(kind: Kind, options: EvidenceOptions = DEFAULTS.evidence) -> float:
+    """Return the log of the prior density of a kind's angle and sizes.
+
+    Sizes are uniform up to :func:`max_size`, angles over the kind's period. Where the longer size is first by
+    definition, each shape has two names in the parameters' full range, of which one is found.
+
+    Args:
+        kind: the kind.
+        options: the largest extent.
+
+    Returns:
+        Nats (for metres and radians).
+    """
+    sizes = len(kind.sizes) * math.log(kind.extent / options.max_extent)
     angle = 0.0 if kind.row.period is None else -math.log(kind.row.period)
     return sizes + angle + (math.log(2) if kind.longer_first else 0.0)
 
 
-def laplace(fit: Fit, dispersion: float = 1.0) -> float:
-    """The logarithm of a fit's evidence, where its likelihood is a Gaussian's."""
+def laplace_evidence(fit: KindFit, dispersion: float = 1.0, options: EvidenceOptions = DEFAULTS.evidence) -> float:
+    """Approximate a fit's log evidence by Laplace's method.
+
+    Args:
+        fit: the maximum-likelihood fit.
+        dispersion: by which the log-likelihood is divided (quasi-likelihood; McCullagh and Nelder 1989).
+        options: the prior.
+
+    Returns:
+        Nats.
+    """
     size = len(fit.information)
     _, log_determinant = np.linalg.slogdet(fit.information / dispersion + np.eye(size))
     volume = 0.5 * (size * math.log(2 * math.pi) - log_determinant)
-    return float(-fit.cost / dispersion + volume + log_prior(fit.kind))
+    return float(-fit.cost / dispersion + volume + log_prior(fit.kind, options))
 
 
 @dataclass(frozen=True)
-class Sampled:
-    """A kind's own parameters (K,): mean and covariance; the logarithm of its evidence; the mean's cost (nats)."""
+class KindPosterior:
+    """The posterior of one kind's own parameters (K,).
+
+    Attributes:
+        mean: (K,).
+        covariance: (K, K).
+        log_evidence: nats.
+        cost: negative log-likelihood at the mean (nats).
+        effective_samples: Kish's effective sample size.
+    """
 
     mean: FloatArray
     covariance: FloatArray
-    evidence: float
+    log_evidence: float
     cost: float
-    effective: float
+    effective_samples: float
 
 
-def sample(fit: Fit, beams: Beams, sensor: Sensor) -> Sampled:
-    """A kind's parameters over all that rays allow, by importance sampling in rounds, each drawn from the last one's.
+def importance_sample(
+    fit: KindFit, bundle: RayBundle, sensor: BeamModel, options: EvidenceOptions = DEFAULTS.evidence
+) -> KindPosterior:
+    """Compute a kind's posterior and evidence by adaptive importance sampling, each round drawn from the last one's.
 
-    Rays that surely hit the shape are summed up once, as a parabola around the fit; what is left to be asked for each
-    sample is the few that pass so near to the silhouette that they might miss it or not.
+    Args:
+        fit: the maximum-likelihood fit.
+        bundle: the rays.
+        sensor: the sensor.
+        options: the prior and the sampler's numbers.
+
+    Returns:
+        The posterior; its log evidence is -inf where no sample is a shape that the prior allows.
     """
     tie = TIES[fit.kind]
     size = tie.shape[1]
     own = tie / (tie**2).sum(axis=0)
     at = fit.p @ own
-    floor = np.array(LEAST_STD) @ own
+    floor = np.array(options.min_std) @ own
     information = fit.information / sensor.dispersion + np.eye(size)
-    mean, spread = at, _bounded(np.linalg.inv(information), fit.kind, floor)
-    split = Split.of(fit, tie @ (16 * spread) @ tie.T, beams, sensor)
-    rounds = _draws(size)
+    mean, spread = at, _bounded(np.linalg.inv(information), fit.kind, floor, options)
+    wide = tie @ (options.sure_deviations**2 * spread) @ tie.T
+    split = SplitCost.of(fit, wide, bundle, sensor, options)
+    rounds = _draws(size, options)
     for count, (standard, log_density) in enumerate(rounds, start=1):
         lower = np.linalg.cholesky(spread)
         points = mean + standard @ lower.T
         cost = split.costs(points @ tie.T)
         log_weight = -cost / sensor.dispersion - log_density + np.log(np.diag(lower)).sum()
-        if not np.isfinite(log_weight).any():  # none of them is a primitive of a size that is looked for
-            return Sampled(at, spread, -math.inf, fit.cost, 0.0)
+        if not np.isfinite(log_weight).any():
+            return KindPosterior(at, spread, -math.inf, fit.cost, 0.0)
         weight = np.exp(log_weight - log_weight.max())
-        share = _tempered(weight, EFFECTIVE if count < len(rounds) else LEAST_EFFECTIVE)
+        last = count == len(rounds)
+        share = _tempered(weight, options.min_effective_last if last else options.min_effective)
         mean = share @ points
         centred = points - mean
         covariance = (share[:, None] * centred).T @ centred
-        spread = _bounded(covariance, fit.kind, floor)
-    evidence = float(log_weight.max() + np.log(weight.mean())) + log_prior(fit.kind)
-    return Sampled(
+        spread = _bounded(covariance, fit.kind, floor, options)
+    log_evidence = float(log_weight.max() + np.log(weight.mean())) + log_prior(fit.kind, options)
+    return KindPosterior(
         mean,
         covariance + np.diag(floor**2) / 100,
-        evidence,
+        log_evidence,
         float(split.costs((tie @ mean)[None])[0]),
         float(1 / (share**2).sum()),
     )
 
 
 @dataclass(frozen=True)
-class Split:
-    """The cost of shapes near a fit: a parabola for the rays that surely hit, a constant for those that surely miss,
-    and the rays that might do either.
+class SplitCost:
+    """The negative log-likelihood of shapes near a fit, exact only where it must be.
+
+    A second-order expansion for the rays that surely hit, a constant for those that surely miss, and the likelihood
+    itself for the ``unsure`` ones near the silhouette.
     """
 
-    fit: Fit
+    fit: KindFit
     constant: float
     gradient: FloatArray
     information: FloatArray
-    unsure: Beams
-    sensor: Sensor
+    unsure: RayBundle
+    sensor: BeamModel
+    options: EvidenceOptions
 
     @classmethod
-    def of(cls, fit: Fit, covariance: FloatArray, beams: Beams, sensor: Sensor) -> Split:
-        """Splits beams by whether they hit shapes whose parameters have a ``covariance`` (5, 5) around the fit's."""
-        sure = np.empty(len(beams))
-        margins(FAMILY[fit.kind], fit.p, covariance, beams.rays, sensor.footprint, sure)
+    def of(
+        cls,
+        fit: KindFit,
+        covariance: FloatArray,
+        bundle: RayBundle,
+        sensor: BeamModel,
+        options: EvidenceOptions = DEFAULTS.evidence,
+    ) -> SplitCost:
+        """Split rays by whether they hit all shapes within a standard deviation of the fit.
+
+        Args:
+            fit: the fit.
+            covariance: (5, 5) of the shapes' parameters around it.
+            bundle: the rays.
+            sensor: the sensor.
+            options: the prior's bounds.
+
+        Returns:
+            The cost.
+        """
+        number = NUMBERS[fit.kind]
+        sure = np.empty(len(bundle))
+        standardized_clearances(OUTLINES, number, fit.p, covariance, bundle.rays, sensor.footprint, sure)
         hit, missed = sure > 1, sure < -1
-        gradient, information = np.zeros(PARAMETERS), np.zeros((PARAMETERS, PARAMETERS))
-        surely = beams.of(hit)
-        constant = slopes(
-            FAMILY[fit.kind],
-            fit.p,
-            surely.rays,
-            surely.kinds,
-            sensor.std,
-            sensor.table,
-            1e-9,
-            gradient,
-            information,
-        )
-        constant -= float(beams.rays[MISS, missed].sum())
-        return cls(fit, constant, gradient, information, beams.of(~hit & ~missed), sensor)
+        slope, information = np.zeros(PARAMETERS), np.zeros((PARAMETERS, PARAMETERS))
+        constant = gradient(OUTLINES, number, fit.p, sensor.data(bundle.select(hit)), EXACT, slope, information)
+        constant -= float(bundle.rays[BACKGROUND, missed].sum())
+        return cls(fit, constant, slope, information, bundle.select(~hit & ~missed), sensor, options)
 
     def costs(self, shapes: FloatArray) -> FloatArray:
-        """The costs (nats) of shapes (M, 5); infinite where a size is none."""
+        """Return the costs (M,) in nats of shapes (M, 5); infinite where a size is out of the prior's bounds."""
         moved = shapes - self.fit.p
-        parabola = self.constant + moved @ self.gradient + 0.5 * ((moved @ self.information) * moved).sum(axis=1)
-        return np.asarray(parabola + exact_costs(self.fit.kind, shapes, self.unsure, self.sensor))
+        expansion = self.constant + moved @ self.gradient + 0.5 * ((moved @ self.information) * moved).sum(axis=1)
+        return np.asarray(expansion + exact_costs(self.fit.kind, shapes, self.unsure, self.sensor, self.options))
 
 
-def _tempered(weight: FloatArray, least: float) -> FloatArray:
-    """Weights, made more alike until this share of the samples counts."""
+def _tempered(weight: FloatArray, min_share: float) -> FloatArray:
+    """Return normalised importance weights, tempered until their effective sample size is this share at least."""
     power = 1.0
     share = weight / weight.sum()
-    while 1 / (share**2).sum() < least * len(weight) and power > 1e-3:
+    while 1 / (share**2).sum() < min_share * len(weight) and power > 1e-3:
         power *= 0.7
         share = weight**power / (weight**power).sum()
     return np.asarray(share)
 
 
-def _bounded(covariance: NDArray[np.floating], kind: Kind, floor: FloatArray) -> FloatArray:
-    """A covariance that samples can be drawn with: no narrower than ``floor``, no wider in angle than MOST_TURN."""
+def _bounded(covariance: NDArray[np.floating], kind: Kind, floor: FloatArray, options: EvidenceOptions) -> FloatArray:
+    """Return a proposal's covariance: no narrower than ``floor`` (K,), no wider in angle than the bound."""
     bounded = covariance + np.diag(floor**2)
-    if kind.has_angle and bounded[2, 2] > MOST_TURN**2:
+    if kind.has_angle and bounded[2, 2] > options.max_turn**2:
         shrink = np.ones(len(bounded))
-        shrink[2] = MOST_TURN / math.sqrt(bounded[2, 2])
+        shrink[2] = options.max_turn / math.sqrt(bounded[2, 2])
         bounded = bounded * shrink * shrink[:, None]
     return np.asarray(bounded)
 
 
 @lru_cache(maxsize=8)
-def _draws(size: int) -> list[tuple[FloatArray, FloatArray]]:
-    """Each round's samples (N, K) of Student's t around 0, in pairs that mirror each other, and their log-densities.
+def _draws(size: int, options: EvidenceOptions) -> list[tuple[FloatArray, FloatArray]]:
+    """Return each round's standard samples (N, K) of Student's t, in antithetic pairs, and their log densities (N,).
 
-    They are the same every time.
+    They are the same every time, so that results are reproducible.
     """
     rounds = []
     rng = np.random.default_rng(size)
-    constant = math.lgamma((DEGREES + size) / 2) - math.lgamma(DEGREES / 2) - size / 2 * math.log(math.pi * DEGREES)
-    for count in SAMPLES:
+    nu = options.degrees
+    constant = math.lgamma((nu + size) / 2) - math.lgamma(nu / 2) - size / 2 * math.log(math.pi * nu)
+    for count in options.samples:
         normal = rng.standard_normal((count // 2, size))
-        half = normal * np.sqrt(DEGREES / rng.chisquare(DEGREES, count // 2))[:, None]
+        half = normal * np.sqrt(nu / rng.chisquare(nu, count // 2))[:, None]
         points = np.concatenate((half, -half))
-        density = constant - (DEGREES + size) / 2 * np.log1p((points**2).sum(axis=1) / DEGREES)
+        density = constant - (nu + size) / 2 * np.log1p((points**2).sum(axis=1) / nu)
         rounds.append((points, density))
     return rounds
 
 
-def exact_costs(kind: Kind, shapes: FloatArray, beams: Beams, sensor: Sensor) -> FloatArray:
-    """The exact costs (nats) of shapes (M, 5); infinite where a size is none, or longer than any."""
+def exact_costs(
+    kind: Kind,
+    shapes: FloatArray,
+    bundle: RayBundle,
+    sensor: BeamModel,
+    options: EvidenceOptions = DEFAULTS.evidence,
+) -> FloatArray:
+    """Compute the exact negative log-likelihoods of shapes.
+
+    Args:
+        kind: their kind.
+        shapes: (M, 5) parameters.
+        bundle: the rays.
+        sensor: the sensor.
+        options: the prior's bounds.
+
+    Returns:
+        (M,) in nats; infinite where a size is out of the prior's bounds.
+    """
     out = np.empty(len(shapes))
-    right = np.asarray(((shapes[:, 3:] > 1e-3) & (shapes[:, 3:] < longest(kind))).all(axis=1))
-    safe = np.where(right[:, None], shapes, shapes[np.argmax(right)])
-    costs(
-        np.full(len(shapes), FAMILY[kind]),
-        np.ascontiguousarray(safe),
-        beams.rays,
-        beams.kinds,
-        sensor.std,
-        sensor.table,
-        sensor.footprint,
-        out,
-    )
-    return np.where(right, out, np.inf)
+    sizes = shapes[:, 3:]
+    allowed = np.asarray(((sizes > POSITIVE) & (sizes < max_size(kind, options))).all(axis=1))
+    safe = np.ascontiguousarray(np.where(allowed[:, None], shapes, shapes[np.argmax(allowed)]))
+    numbers = np.full(len(shapes), NUMBERS[kind])
+    negative_log_likelihoods(OUTLINES, numbers, safe, sensor.data(bundle), sensor.footprint, out)
+    return np.where(allowed, out, np.inf)
 
 
 @dataclass(frozen=True)
-class Weighed:
-    """The likeliest kind's primitive; ``std`` (m, rad) by name and ``covariance`` in their order; the ``chances`` of
-    all kinds; the primitive's ``cost`` (nats).
+class Posterior:
+    """The posterior over kinds and the likeliest kind's parameters.
+
+    Attributes:
+        primitive: the likeliest kind at its posterior mean.
+        std: standard deviations (m, rad) by parameter name.
+        covariance: (K, K) in the same order.
+        chances: posterior probabilities of all kinds; they sum to 1.
+        cost: negative log-likelihood of the primitive (nats).
     """
 
     primitive: Primitive
@@ -224,59 +292,85 @@ class Weighed:
     cost: float
 
 
-def weighed(
-    fits: Sequence[Fit], beams: Beams, sensor: Sensor, may_be: Callable[[Primitive], bool] = lambda _: True
-) -> Weighed | None:
-    """Fits of several kinds to the same beams, weighed by their evidence; no kind is likelier beforehand.
+def compare_kinds(
+    fits: Sequence[KindFit],
+    bundle: RayBundle,
+    sensor: BeamModel,
+    is_possible: Callable[[Primitive], bool] = lambda _: True,
+    options: EvidenceOptions = DEFAULTS.evidence,
+) -> Posterior | None:
+    """Compare fits of several kinds to the same rays by their evidence, all kinds being equally likely a priori.
 
-    Those are left out whose primitive, over all that the rays allow, is none that ``may_be``. None where that leaves
-    nothing, or where all are larger than a primitive is.
+    Args:
+        fits: one fit for each kind.
+        bundle: the rays.
+        sensor: the sensor.
+        is_possible: whether a primitive may be there at all; kinds whose posterior mean may not are left out.
+        options: the prior and the sampler's numbers.
+
+    Returns:
+        The posterior, or None where no kind is left, or all are larger than the prior allows.
     """
-    fits = [fit for fit in fits if (fit.p[3:] < longest(fit.kind)).all()]
+    fits = [fit for fit in fits if (fit.p[3:] < max_size(fit.kind, options)).all()]
     if not fits:
         return None
-    rough = {fit.kind: laplace(fit, sensor.dispersion) for fit in fits}
+    rough = {fit.kind: laplace_evidence(fit, sensor.dispersion, options) for fit in fits}
     top = max(rough.values())
-    sampled = {fit.kind: sample(fit, beams, sensor) for fit in fits if rough[fit.kind] > top - CONTENDER}
-    sampled |= _simpler_ones(fits, sampled, beams, sensor)
-    for kind, made in sampled.items():
-        if not may_be(told(kind, made)[0]):
-            sampled[kind] = replace(made, evidence=-math.inf)
-    kind = max(sampled, key=lambda one: sampled[one].evidence)
-    best = sampled[kind].evidence
-    if best == -math.inf:
+    contenders = [fit for fit in fits if rough[fit.kind] > top - options.contender]
+    sampled = {fit.kind: importance_sample(fit, bundle, sensor, options) for fit in contenders}
+    sampled |= _merged_special_cases(fits, sampled, bundle, sensor, options)
+    for kind, posterior in sampled.items():
+        if not is_possible(summarize(kind, posterior)[0]):
+            sampled[kind] = replace(posterior, log_evidence=-math.inf)
+    best = max(sampled, key=lambda kind: sampled[kind].log_evidence)
+    highest = sampled[best].log_evidence
+    if highest == -math.inf:
         return None
-    weights = {one: math.exp(sampled[one].evidence - best if one in sampled else rough[one] - top) for one in rough}
-    chances = {one: weights.get(one, 0.0) / sum(weights.values()) for one in Kind}
-    primitive, std, covariance = told(kind, sampled[kind])
-    return Weighed(primitive, std, covariance, chances, sampled[kind].cost)
+    weights = {
+        kind: math.exp(sampled[kind].log_evidence - highest if kind in sampled else rough[kind] - top)
+        for kind in rough
+    }
+    chances = {kind: weights.get(kind, 0.0) / sum(weights.values()) for kind in Kind}
+    primitive, std, covariance = summarize(best, sampled[best])
+    return Posterior(primitive, std, covariance, chances, sampled[best].cost)
 
 
-def _simpler_ones(
-    fits: Sequence[Fit], sampled: Mapping[Kind, Sampled], beams: Beams, sensor: Sensor
-) -> dict[Kind, Sampled]:
-    """Squares and circles for rectangles and ellipses whose sizes are the SAME_SIZES: these are no other kind.
-
-    The simpler one gets all the evidence of both.
-    """
-    made = {}
-    for kind, simpler in SIMPLER.items():
-        fit = next((one for one in fits if one.kind is simpler), None)
-        if fit is None or kind not in sampled or abs(sampled[kind].mean[3] - sampled[kind].mean[4]) > SAME_SIZES:
+def _merged_special_cases(
+    fits: Sequence[KindFit],
+    sampled: Mapping[Kind, KindPosterior],
+    bundle: RayBundle,
+    sensor: BeamModel,
+    options: EvidenceOptions,
+) -> dict[Kind, KindPosterior]:
+    """Return squares and circles in the place of rectangles and ellipses whose sizes agree, with both's evidence."""
+    merged = {}
+    for kind, special in SPECIAL_CASES.items():
+        fit = next((fit for fit in fits if fit.kind is special), None)
+        if fit is None or kind not in sampled:
             continue
-        simple = sampled.get(simpler) or sample(fit, beams, sensor)
-        both = np.logaddexp(simple.evidence, sampled[kind].evidence)
-        made[simpler] = replace(simple, evidence=float(both))
-        made[kind] = replace(sampled[kind], evidence=-math.inf)
-    return made
+        if abs(sampled[kind].mean[3] - sampled[kind].mean[4]) > options.same_sizes:
+            continue
+        simple = sampled.get(special) or importance_sample(fit, bundle, sensor, options)
+        both = np.logaddexp(simple.log_evidence, sampled[kind].log_evidence)
+        merged[special] = replace(simple, log_evidence=float(both))
+        merged[kind] = replace(sampled[kind], log_evidence=-math.inf)
+    return merged
 
 
-def told(kind: Kind, made: Sampled) -> tuple[Primitive, dict[str, float], FloatArray]:
-    """The primitive that samples tell, its standard deviations by name, and its covariance in their order."""
-    primitive = primitive_of(kind, TIES[kind] @ made.mean)
-    names, covariance = kind.parameters, made.covariance
-    if kind.longer_first and made.mean[3] < made.mean[4]:
+def summarize(kind: Kind, posterior: KindPosterior) -> tuple[Primitive, dict[str, float], FloatArray]:
+    """Express a posterior in a primitive's canonical parameters.
+
+    Args:
+        kind: the kind.
+        posterior: its posterior.
+
+    Returns:
+        The primitive at the mean, standard deviations (m, rad) by name, and the covariance (K, K) in their order.
+    """
+    primitive = primitive_of(kind, TIES[kind] @ posterior.mean)
+    covariance = posterior.covariance
+    if kind.longer_first and posterior.mean[3] < posterior.mean[4]:
         order = [0, 1, 2, 4, 3]
         covariance = covariance[np.ix_(order, order)]
     std = np.sqrt(np.diag(covariance)).tolist()
-    return primitive, dict(zip(names, std, strict=True)), covariance
+    return primitive, dict(zip(kind.parameters, std, strict=True)), covariance

@@ -1,4 +1,9 @@
-"""Kinds fitted to the rays that pass a candidate: from starts to the nearest best parameters."""
+"""Maximum likelihood: kinds fitted to the rays of a candidate, from several starts each.
+
+The likelihood is rough and has several maxima (Levenberg and Marquardt's method finds the nearest one), so that every
+kind is fitted from starts that are turned and mirrored; its special cases, and what it is a special case of, start
+each other.
+"""
 
 from __future__ import annotations
 
@@ -8,57 +13,28 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from detect.refinement.kernels import PARAMETERS, costs, descend
-from detect.refinement.rays import FAMILY, Beams, Sensor, parameters
+from detect.refinement.geometry import NUMBERS, OUTLINES, TIES, parameters_of
+from detect.refinement.kernels import PARAMETERS, Schedule, descend, negative_log_likelihoods
+from detect.refinement.options import DEFAULTS, Descent, FitOptions
+from detect.refinement.rays import RayBundle
+from detect.refinement.sensor_model import BeamModel
 from prim.arrays import FloatArray
 from prim.shapes import Kind, Primitive
 
-COARSE_RAYS, SEARCH_RAYS = 800, 1600
-"""To about so many rays starts are fitted, and what comes of the best of them."""
-
-KNOWN_TO = 0.001
-"""What silhouettes tell is asked with this blur (m): it is a sum of jumps, which narrower ones would take for all."""
+SPECIAL_CASES = {kind: kind.special_case for kind in Kind if kind.special_case is not None}
+"""For each kind with a special case (rectangle: square; ellipse: circle) that; both are fitted wherever one is."""
 
 
 @dataclass(frozen=True)
-class Descent:
-    """How a fit descends: from one blur (m, half a footprint) to the next, none smaller than the sensor's own, with
-    no more than so many ``steps`` at each, ending where a step gains less than the ``tolerance`` (nats).
+class KindFit:
+    """A kind fitted to rays.
+
+    Attributes:
+        kind: the kind.
+        p: (5,) the maximum-likelihood parameters x, y (m), theta (rad), width, height (m).
+        cost: negative log-likelihood there (nats).
+        information: (K, K) on the kind's own parameters.
     """
-
-    blurs: tuple[float, ...]
-    steps: int
-    tolerance: float
-
-
-COARSE = Descent((0.03, 0.012), 8, 0.5)
-FINE = Descent((0.008, 0.001), 10, 0.1)
-LAST = Descent((0.012, 0.004, 0.001, 0.0003), 10, 0.1)
-"""From starts, to tell what to go on with; from the best of these; and from fits that were made before: as narrow as
-silhouettes are known.
-"""
-
-HOPELESS, HOPELESS_WAY = 60.0, 20.0
-"""A kind whose coarse fit is this much (nats) less likely than the best one's is not fitted to all rays, nor is
-another way to the same kind by so much.
-"""
-
-WAYS = 2
-"""So many of a kind's coarse fits are gone on with."""
-
-ALIKE = 1.3
-"""A triangle whose sides are no more unlike than this may have been fitted with the wrong apex."""
-
-SIMPLER = {kind: kind.special_case for kind in Kind if kind.special_case is not None}
-"""Kinds that are special cases of others; each is fitted wherever the other is."""
-
-STRETCHED = 1.03
-"""An ellipse begins with a circle whose one axis is so much longer, the other so much shorter."""
-
-
-@dataclass(frozen=True)
-class Fit:
-    """A kind fitted to rays: the five parameters, the cost (nats), and the information on its own parameters."""
 
     kind: Kind
     p: FloatArray
@@ -66,43 +42,47 @@ class Fit:
     information: FloatArray
 
 
-Way = tuple[Kind, FloatArray]
-"""A kind, and the five parameters that a fit of it begins with."""
+Start = tuple[Kind, FloatArray]
+"""A kind, and the parameters (5,) that a fit of it begins with."""
 
 
 @dataclass(frozen=True)
-class Share:
-    """Some beams, ``each`` of which stands for so many."""
+class Subset:
+    """Every ``stride``-th ray of a bundle."""
 
-    beams: Beams
-    each: int = 1
+    bundle: RayBundle
+    stride: int = 1
 
     @classmethod
-    def of(cls, beams: Beams, about: int) -> Share:
-        """About so many of the beams, evenly spread."""
-        each = max(1, len(beams) // about)
-        return cls(beams.of(slice(None, None, each)), each) if each > 1 else cls(beams)
+    def of(cls, bundle: RayBundle, about: int) -> Subset:
+        """Choose rays evenly.
+
+        Args:
+            bundle: the rays.
+            about: about how many.
+
+        Returns:
+            The subset.
+        """
+        stride = max(1, len(bundle) // about)
+        return cls(bundle.select(slice(None, None, stride)), stride) if stride > 1 else cls(bundle)
 
 
-def _tie(kind: Kind) -> FloatArray:
-    """The matrix (5, K) from a kind's own parameters to x, y, theta, width, height."""
-    full = np.eye(PARAMETERS)
-    columns = [full[0], full[1], *([full[2]] if kind.has_angle else [])]
-    columns += [full[3] + full[4]] if kind.is_tied else [full[3], full[4]]
-    return np.column_stack(columns)
+def starts(guess: Primitive, kind: Kind) -> list[FloatArray]:
+    """Make starts of a kind's fit for what was taken for another: same centroid, same second moments of area.
 
+    Args:
+        guess: what it was taken for.
+        kind: the kind to fit.
 
-TIES = {kind: _tie(kind) for kind in Kind}
-"""For each kind the matrix (5, K) that maps its own parameters to x, y, theta, width, height."""
-
-
-def starts(of: Primitive, kind: Kind) -> list[FloatArray]:
-    """Where the fit of a kind begins, for something that was first taken for ``of``: same place, same spread."""
-    x, y, theta, *sizes = parameters(of).tolist()
-    spread = [size / math.sqrt(factor) for size, factor in zip(sizes, of.kind.spread_factors, strict=True)]
+    Returns:
+        Parameters (5,), one for each start angle.
+    """
+    x, y, theta, *sizes = parameters_of(guess).tolist()
+    spread = [size / math.sqrt(factor) for size, factor in zip(sizes, guess.kind.spread_factors, strict=True)]
     made = []
     mean = math.sqrt(spread[0] * spread[1])
-    for turn in start_turns(kind, of.kind):
+    for turn in start_turns(kind, guess.kind):
         along, across = spread
         if abs(math.sin(turn)) > 0.9:
             along, across = across, along
@@ -113,145 +93,214 @@ def starts(of: Primitive, kind: Kind) -> list[FloatArray]:
     return made
 
 
-def start_turns(kind: Kind, of: Kind) -> list[float]:
-    """Angles (rad) from something that was taken for a kind to the starts of another kind's fit."""
+def start_turns(kind: Kind, guessed: Kind) -> list[float]:
+    """Choose the angles from a guess at which fits of a kind start.
+
+    Half of the symmetry where a quarter turn is covered by exchanging the sizes or by the symmetry itself, quarter
+    turns else; and where the guess is of this kind already, the turns that almost regular shapes confuse.
+
+    Args:
+        kind: the kind to fit.
+        guessed: the guess's kind.
+
+    Returns:
+        Angles (rad).
+    """
     row = kind.row
     if row.period is None:
         return [0.0]
     if kind.longer_first or row.period <= math.pi / 2:
         return [0.0, min(row.period, math.pi / 2) / 2]
     turns = [0.0, math.pi / 2, math.pi, -math.pi / 2]
-    if kind is of and row.regular_period is not None:
+    if kind is guessed and row.regular_period is not None:
         turns += [row.regular_period, -row.regular_period]
     return turns
 
 
-def search(now: Primitive, before: Sequence[Fit], beams: Beams, sensor: Sensor) -> list[Fit]:
-    """Every kind that may explain what was taken for a primitive, fitted to its beams.
+def fit_all_kinds(
+    guess: Primitive,
+    earlier: Sequence[KindFit],
+    bundle: RayBundle,
+    sensor: BeamModel,
+    options: FitOptions = DEFAULTS.fit,
+) -> list[KindFit]:
+    """Fit every kind that may explain a candidate's rays.
 
-    Starts are fitted to some of the rays, and held against all of them, beside what it was taken for ``now`` and what
-    fits it had ``before``; from the best of each kind the fit goes on with more rays.
+    All starts are fitted to some of the rays and compared on all of them, beside the guess and earlier fits; the
+    best of each kind are fitted to more rays.
+
+    Args:
+        guess: what the candidate is taken for.
+        earlier: earlier fits.
+        bundle: its rays.
+        sensor: the sensor.
+        options: the numbers.
+
+    Returns:
+        The best fit of each kind that is not out of the question.
     """
-    ways = [(kind, p) for kind in Kind for p in starts(now, kind)]
-    coarse = _fit_each(ways, Share.of(beams, COARSE_RAYS), sensor, COARSE)
-    made = [(fit.kind, fit.p) for fit in (*coarse, *before)]
-    ranked = _ranked([*made, (now.kind, parameters(now))], beams, sensor)
+    begin = [(kind, p) for kind in Kind for p in starts(guess, kind)]
+    coarse = _fit_each(begin, Subset.of(bundle, options.coarse_rays), sensor, options.coarse, options)
+    made = [(fit.kind, fit.p) for fit in (*coarse, *earlier)]
+    ranked = _ranked([*made, (guess.kind, parameters_of(guess))], bundle, sensor, options)
     best: dict[Kind, float] = {}
     for cost, (kind, _) in ranked:
         best.setdefault(kind, cost)
-    hopeful = {kind for kind, cost in best.items() if cost < min(best.values()) + HOPELESS}
-    hopeful |= {simple for kind, simple in SIMPLER.items() if kind in hopeful}
-    chosen: list[Way] = []
+    hopeful = {kind for kind, cost in best.items() if cost < min(best.values()) + options.hopeless_kind}
+    hopeful |= {special for kind, special in SPECIAL_CASES.items() if kind in hopeful}
+    chosen: list[Start] = []
     for kind in Kind:
-        own = [way for cost, way in ranked if way[0] is kind and cost < best[kind] + HOPELESS_WAY]
-        chosen += own[:WAYS] if kind in hopeful else []
-    return _finely(chosen, Share.of(beams, SEARCH_RAYS), sensor, FINE)
+        limit = best[kind] + options.hopeless_start
+        own = [start for cost, start in ranked if start[0] is kind and cost < limit]
+        chosen += own[: options.starts_kept] if kind in hopeful else []
+    return _best_of_each_kind(chosen, Subset.of(bundle, options.search_rays), sensor, options.fine, options)
 
 
-def _ranked(ways: Sequence[Way], beams: Beams, sensor: Sensor) -> list[tuple[float, Way]]:
-    """Ways with their costs (nats) over all beams, somewhat blurred, best first."""
-    out = np.empty(len(ways))
-    families = np.array([FAMILY[kind] for kind, _ in ways])
-    shapes = np.stack([p for _, p in ways])
-    costs(families, shapes, beams.rays, beams.kinds, sensor.std, sensor.table, FINE.blurs[0], out)
-    return sorted(zip(out.tolist(), ways, strict=True), key=lambda one: one[0])
+def _ranked(
+    candidates: Sequence[Start], bundle: RayBundle, sensor: BeamModel, options: FitOptions
+) -> list[tuple[float, Start]]:
+    """Return starts with their costs (nats) over all rays at the first fine blur, best first."""
+    out = np.empty(len(candidates))
+    numbers = np.array([NUMBERS[kind] for kind, _ in candidates])
+    shapes = np.stack([p for _, p in candidates])
+    negative_log_likelihoods(OUTLINES, numbers, shapes, sensor.data(bundle), options.fine.blurs[0], out)
+    return sorted(zip(out.tolist(), candidates, strict=True), key=lambda item: item[0])
 
 
-def again(fits: Sequence[Fit], beams: Beams, sensor: Sensor) -> list[Fit]:
-    """Kinds fitted again, from where they are, beside those that they are special cases of."""
-    return _finely([(fit.kind, fit.p) for fit in fits], Share(beams), sensor, LAST)
+def refit(
+    fits: Sequence[KindFit], bundle: RayBundle, sensor: BeamModel, options: FitOptions = DEFAULTS.fit
+) -> list[KindFit]:
+    """Fit kinds to all rays from earlier fits, beside their special cases and what they are special cases of.
 
+    Args:
+        fits: the earlier fits.
+        bundle: all rays.
+        sensor: the sensor.
+        options: the numbers.
 
-def again_alone(fit: Fit, beams: Beams, sensor: Sensor) -> list[Fit]:
-    """One kind fitted again, and no other."""
-    return _fit_each([(fit.kind, fit.p)], Share(beams), sensor, LAST)
-
-
-def _finely(ways: Sequence[Way], share: Share, sensor: Sensor, how: Descent) -> list[Fit]:
-    """The best fit of each kind from some ways to it; a triangle's also with the other two corners as its apex, a
-    rectangle's and an ellipse's also from the square or circle that it is no better than.
+    Returns:
+        The best fit of each kind.
     """
-    best: dict[Kind, Fit] = {}
+    begin = [(fit.kind, fit.p) for fit in fits]
+    return _best_of_each_kind(begin, Subset(bundle), sensor, options.last, options)
 
-    def keep(fits: Sequence[Fit]) -> None:
+
+def refit_same_kind(
+    fit: KindFit, bundle: RayBundle, sensor: BeamModel, options: FitOptions = DEFAULTS.fit
+) -> list[KindFit]:
+    """Fit one kind, and no other, to all rays from an earlier fit.
+
+    Args:
+        fit: the earlier fit.
+        bundle: all rays.
+        sensor: the sensor.
+        options: the numbers.
+
+    Returns:
+        The fit alone.
+    """
+    return _fit_each([(fit.kind, fit.p)], Subset(bundle), sensor, options.last, options)
+
+
+def _best_of_each_kind(
+    begin: Sequence[Start], subset: Subset, sensor: BeamModel, descent: Descent, options: FitOptions
+) -> list[KindFit]:
+    """Return the best fit of each kind from some starts, other apexes, and special cases that are no worse."""
+    best: dict[Kind, KindFit] = {}
+
+    def keep(fits: Sequence[KindFit]) -> None:
         for fit in fits:
             if fit.kind not in best or fit.cost < best[fit.kind].cost:
                 best[fit.kind] = fit
 
-    keep(_fit_each(ways, share, sensor, how))
-    others = [(kind, p) for kind, fit in best.items() if kind.corners == 3 for p in other_apexes(fit.p)]
-    keep(_fit_each(others, share, sensor, how))
-    stuck = [
-        (kind, p)
-        for kind, simple in SIMPLER.items()
-        if simple in best and (kind not in best or best[kind].cost > best[simple].cost - how.tolerance)
-        for p in unlike(kind, best[simple].p)
+    keep(_fit_each(begin, subset, sensor, descent, options))
+    apexes = [
+        (kind, p) for kind, fit in best.items() if kind.corners == 3 for p in other_apexes(fit.p, options.equilateral)
     ]
-    keep(_fit_each(stuck, share, sensor, how))
+    keep(_fit_each(apexes, subset, sensor, descent, options))
+    no_better = [
+        (kind, p)
+        for kind, special in SPECIAL_CASES.items()
+        if special in best and (kind not in best or best[kind].cost > best[special].cost - descent.tolerance)
+        for p in beyond_special_case(kind, best[special].p, options.stretch)
+    ]
+    keep(_fit_each(no_better, subset, sensor, descent, options))
     return list(best.values())
 
 
-def unlike(kind: Kind, p: FloatArray) -> list[FloatArray]:
-    """Where the fit of a ``kind`` begins whose special case has parameters ``p``: with these for a rectangle, in four
-    directions a little longer for an ellipse, since a circle has none to turn to.
+def beyond_special_case(kind: Kind, p: FloatArray, stretch: float = DEFAULTS.fit.stretch) -> list[FloatArray]:
+    """Make starts of a kind's fit from a fit of its special case.
+
+    Where that has no angle, they are stretched along four directions, since there is none to turn to.
+
+    Args:
+        kind: the kind.
+        p: (5,) parameters of its special case.
+        stretch: by which factor.
+
+    Returns:
+        Parameters (5,) of the starts.
     """
-    if SIMPLER[kind].has_angle:
+    if SPECIAL_CASES[kind].has_angle:
         return [p]
-    longer = np.array([STRETCHED, 1 / STRETCHED])
+    longer = np.array([stretch, 1 / stretch])
     turns = [quarter * math.pi / 4 for quarter in range(4)]
     return [np.array([p[0], p[1], turn, *(p[3:] * longer)]) for turn in turns]
 
 
-def other_apexes(p: FloatArray) -> list[FloatArray]:
-    """The isosceles triangles most like a triangle that have its other corners as apexes; none where they are unlike.
+def other_apexes(p: FloatArray, equilateral: float = DEFAULTS.fit.equilateral) -> list[FloatArray]:
+    """Find the isosceles triangles most like a given one that have its other corners as apexes.
 
-    Where all sides are much alike, any corner may be taken for the apex.
+    Where all sides are nearly the same, any corner may be taken for the apex.
+
+    Args:
+        p: (5,) parameters of an isosceles triangle: x, y, theta, base, height.
+        equilateral: sides whose ratio is beyond this factor are not nearly the same.
+
+    Returns:
+        Two sets of parameters (5,), or none.
     """
     x, y, theta, base, height = p.tolist()
     leg = math.hypot(base / 2, height)
-    if not 1 / ALIKE < leg / base < ALIKE:
+    if not 1 / equilateral < leg / base < equilateral:
         return []
     mean = (leg + base) / 2  # of the two sides at the new apex; the new base is the leg across from it
     tall = math.sqrt(mean**2 - leg**2 / 4)
     turn = math.pi - math.atan2(height, base / 2)  # from the base to a leg, taken counter-clockwise
-    return [np.array([x, y, theta + way, leg, tall]) for way in (turn, -turn)]
+    return [np.array([x, y, theta + sign, leg, tall]) for sign in (turn, -turn)]
 
 
-def _fit_each(ways: Sequence[Way], share: Share, sensor: Sensor, how: Descent) -> list[Fit]:
-    """The nearest best fit from each way to some of the beams; cost and information are what all would make them."""
-    if not ways:
-        return []
-    ties = np.zeros((len(ways), PARAMETERS, PARAMETERS))
-    sizes = np.array([TIES[kind].shape[1] for kind, _ in ways])
-    for tie, size, (kind, _) in zip(ties, sizes.tolist(), ways, strict=True):
-        tie[:, :size] = TIES[kind]
-    found, cost = np.stack([p for _, p in ways]), np.empty(len(ways))
-    information = np.zeros_like(ties)
-    descend(
-        np.array([FAMILY[kind] for kind, _ in ways]),
-        found,
-        ties,
-        sizes,
-        share.beams.rays,
-        share.beams.kinds,
-        sensor.std,
-        sensor.table,
-        np.array(list(dict.fromkeys(max(blur, sensor.footprint) for blur in how.blurs))),
-        how.steps,
-        how.tolerance / share.each,
-        max(KNOWN_TO, sensor.footprint),
-        cost,
-        information,
+def _schedule(descent: Descent, stride: int, sensor: BeamModel, options: FitOptions) -> Schedule:
+    """Return a descent as the kernel takes it: no blur is narrower than the sensor's footprint."""
+    return Schedule(
+        np.array(list(dict.fromkeys(max(blur, sensor.footprint) for blur in descent.blurs))),
+        descent.steps,
+        descent.tolerance / stride,
+        options.first_damping,
+        options.max_damping,
+        options.min_size,
+        options.max_size,
+        max(options.information_blur, sensor.footprint),
     )
-    cost, information = share.each * cost, share.each * information
+
+
+def _fit_each(
+    begin: Sequence[Start], subset: Subset, sensor: BeamModel, descent: Descent, options: FitOptions
+) -> list[KindFit]:
+    """Fit from each start to a subset of the rays; cost and information are scaled to all rays."""
+    if not begin:
+        return []
+    ties = np.zeros((len(begin), PARAMETERS, PARAMETERS))
+    sizes = np.array([TIES[kind].shape[1] for kind, _ in begin])
+    for tie, size, (kind, _) in zip(ties, sizes.tolist(), begin, strict=True):
+        tie[:, :size] = TIES[kind]
+    shapes, cost = np.stack([p for _, p in begin]), np.empty(len(begin))
+    information = np.zeros_like(ties)
+    numbers = np.array([NUMBERS[kind] for kind, _ in begin])
+    schedule = _schedule(descent, subset.stride, sensor, options)
+    descend(OUTLINES, numbers, shapes, ties, sizes, sensor.data(subset.bundle), schedule, cost, information)
+    cost, information = subset.stride * cost, subset.stride * information
     return [
-        Fit(kind, p, float(nats), known[:size, :size])
-        for (kind, _), p, nats, known, size in zip(ways, found, cost, information, sizes.tolist(), strict=True)
+        KindFit(kind, p, float(nats), known[:size, :size])
+        for (kind, _), p, nats, known, size in zip(begin, shapes, cost, information, sizes.tolist(), strict=True)
     ]
-
-
-def primitive_of(kind: Kind, p: FloatArray) -> Primitive:
-    """A primitive of five parameters, in canonical form."""
-    x, y, theta, width, height = p.tolist()
-    size = (width, height)[: len(kind.sizes)]
-    return Primitive(kind, x, y, theta if kind.has_angle else None, size).canonical()

@@ -1,93 +1,165 @@
-"""The compiled kernels of refinement: how well a primitive explains the rays that pass it.
+"""The compiled kernels of refinement: the likelihood of rays given a shape, its derivatives, and its maximisation.
 
-Every kind is a unit shape (a box, a disc, a triangle) that is stretched, turned and moved, so that one ray in the
-unit shape's own frame tells the distance to all of them, and its derivatives. What a ray says of a shape is where it
-meets it (r) and by how much it hits or misses it (s, the distance of the ray's line from the nearer silhouette).
+A shape is its kind's unit outline (a convex polygon or the unit disc) stretched by width and height, turned by theta
+and moved to (x, y): ``p`` (5,) throughout. In the unit outline's own frame one intersection gives the ray's range r
+to the shape and its derivatives. The other quantity is the clearance s: the signed distance (m) of the ray's line
+from the nearer silhouette point, positive where it hits. A ray that hits has the likelihood of its range at r; one
+that misses has that of the background. At s = 0 the likelihood jumps, so that it has no derivative there. A smooth
+step of half-width ``blur`` (m) blends both over -blur < s < blur; fits reduce it as they converge. With ``blur`` 0
+the likelihood is exact.
 
-A ray that hits has the likelihood of its range at r, one that misses that of what stands behind. Between the two the
-likelihood jumps; a footprint of half-width ``blur`` (m) blends them over -blur < s < blur, so that there is a slope
-to descend: it shrinks as the fit comes near. With ``blur`` 0 the likelihood is exact.
-
-Parameters are always five: x, y, theta, width, height; a square's and a circle's two sizes are tied by the matrix
-that maps a kind's own parameters to these. Compiled code is cached beside this file and made anew when this file
-changes, so that every constant it uses must stand here.
+Kinds with tied sizes (square, circle) or without an angle have fewer parameters of their own; a matrix (5, K) maps
+those to the five. What a kind's outline is comes in as an argument, :class:`Outlines`: compiled code is cached beside
+this file and made anew when this file alone changes, so that nothing that stands elsewhere may be compiled in.
 """
 
 from __future__ import annotations
 
 import math
 from functools import lru_cache
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from prim.arrays import FloatArray
 from prim.compiled import compiled
 
 FAST = {"arcp", "contract", "reassoc", "nsz"}
-"""Divisions by what stays the same may become products; infinities and NaN keep their meaning."""
+"""Fast-math flags: reciprocals, fused operations and other orders of sums; infinities and NaN keep their meaning."""
 
 kernel = compiled(inline="never", fastmath=FAST)
 part = compiled(cache=False, forceinline=True, fastmath=FAST)
-"""What kernels are made of."""
+"""A function that kernels are made of."""
 
-BOX, DISC, TRIANGLE = 0, 1, 2
-"""Unit shapes: [-1/2, 1/2]², radius 1, and corners (-1/2, -1/3), (1/2, -1/3), (0, 2/3)."""
+BOX, ROUND, TRIANGLE, POLYGON = 0, 1, 2, 3
+"""Forms of unit outlines."""
 
-X, Y, THETA, WIDTH, HEIGHT = range(5)
-PARAMETERS = 5
-
-ORIGIN_X, ORIGIN_Y, DIRECTION_X, DIRECTION_Y, RANGE, STOP, MISS = range(7)
-"""Rows of beams (7, N): the ray; the measured range, or the limit it is beyond; from where on (m) something else
-stops it; the logarithm of its likelihood if it misses the shape."""
-
-NEAR, LIMIT = 7, 8
-ROWS = 9
-"""Rows that beams have besides while they are collected: from where on (m) they are near, the largest range (m)."""
-
-MEASURED, TOO_NEAR, NO_RETURN, SAYS_NOTHING = 0, 1, 2, 3
-
-BLOCK = 256
-"""So many rays are held against a shape at once."""
-
-TABLE_REACH = 12.0
-TABLE_SPACING = 64
-"""The tables hold so many entries per standard deviation, up to TABLE_REACH of them at both sides."""
-
-SMALLEST, LARGEST = 0.02, 1.2
-"""Width and height (m; of a disc the semi-axes) stay between these while a fit descends."""
-
-HOPEFUL, HOPELESS = 1e-2, 1e4
-"""A descent's damping begins with the one, and ends it beyond the other."""
+FORMS = {
+    ((-1 / 2, -1 / 2), (1 / 2, -1 / 2), (1 / 2, 1 / 2), (-1 / 2, 1 / 2)): BOX,
+    (): ROUND,
+    ((-1 / 2, -1 / 3), (1 / 2, -1 / 3), (0.0, 2 / 3)): TRIANGLE,
+}
+"""The unit outlines that have code of their own, faster than that of any convex polygon. They stand here as that code
+has them: an outline that was edited in the table of kinds is a polygon.
+"""
 
 EDGE_X = (0.0, 2.0 / math.sqrt(5.0), -2.0 / math.sqrt(5.0))
 EDGE_Y = (-1.0, 1.0 / math.sqrt(5.0), 1.0 / math.sqrt(5.0))
-EDGE_AT = (1.0 / 3.0, 2.0 / (3.0 * math.sqrt(5.0)), 2.0 / (3.0 * math.sqrt(5.0)))
-"""The unit triangle's edges: outward normals, and their distances from the centroid."""
+EDGE_OFFSET = (1.0 / 3.0, 2.0 / (3.0 * math.sqrt(5.0)), 2.0 / (3.0 * math.sqrt(5.0)))
+"""The unit triangle's edges: outward normals, and distances from the centroid."""
+
+X, Y, THETA, WIDTH, HEIGHT = range(5)
+PARAMETERS = 5
+"""Rows of a shape's parameters p."""
+
+ORIGIN_X, ORIGIN_Y, DIRECTION_X, DIRECTION_Y, RANGE, OCCLUSION, BACKGROUND = range(7)
+"""Rows of rays (7, N): origin (m) and unit direction; the measured range (m), or the limit that it is beyond; the
+range (m) from which on something else occludes the shape; the log-likelihood of the measurement by the background.
+"""
+
+NEAREST, MAX_RANGE = 7, 8
+COLLECTED_ROWS = 9
+"""Further rows while rays are collected: the range (m) at which they come near, and the sensor's largest one (m)."""
+
+MEASURED, TOO_NEAR, NO_RETURN, INVALID = 0, 1, 2, 3
+"""Outcomes of a beam, as prim.scan.RangeOutcome; the first three are rows of the table of log-likelihoods."""
+
+BLOCK = 256
+"""Rays that are intersected with a shape at once: their intermediate results fit the fastest cache."""
+
+TABLE_REACH = 12.0
+TABLE_SPACING = 64
+"""Tables reach over so many standard deviations on both sides, with so many entries for each."""
+
+LX, LY, UX, UY, MX, MY, BX, BY, HIGH, LOW, AT_HIGH, AT_LOW = range(12)
+ENTER, NX, NY = HIGH, MX, MY
+SCRATCH_ROWS = 12
+"""Rows of scratch (12, BLOCK) for polygons."""
 
 FAR, BEHIND = 1e30, 1e31
 ENDLESS = 1e20
-"""Stands for the inverse of nothing: a ray along a side never meets it."""
+"""Stand for a miss, for a shape behind the ray's origin, and for the reciprocal of 0 (a ray along an edge)."""
+
+
+class Outlines(NamedTuple):
+    """The unit outlines of all kinds, in the order of :class:`prim.shapes.Kind`.
+
+    ``form`` (K,); of polygons, ``corners`` (K,) vertices each, ``vertices`` (K, V, 2) counter-clockwise, and of the
+    edges from each vertex to the next the outward unit ``normals`` (K, V, 2) and distances ``offsets`` (K, V) from
+    the centroid.
+    """
+
+    form: NDArray[np.int64]
+    corners: NDArray[np.int64]
+    vertices: FloatArray
+    normals: FloatArray
+    offsets: FloatArray
+
+
+class RayData(NamedTuple):
+    """What the likelihood is a function of, besides the shape.
+
+    ``rays`` (7, N), ``outcomes`` (N,), the range noise ``sigma`` (m), and the ``table`` of log-likelihoods of
+    :func:`likelihood_table`.
+    """
+
+    rays: FloatArray
+    outcomes: NDArray[np.int8]
+    sigma: float
+    table: FloatArray
+
+
+class RayStoreView(NamedTuple):
+    """Arrays that rays are collected in: ``rays`` (COLLECTED_ROWS, room), ``outcomes`` and ``scan`` (room,)."""
+
+    rays: FloatArray
+    outcomes: NDArray[np.int8]
+    scan: NDArray[np.int32]
+
+
+class Schedule(NamedTuple):
+    """How Levenberg and Marquardt's method descends.
+
+    ``blurs`` (m), one after the other; at each, at most ``iterations`` steps, ending where one gains less than
+    ``tolerance`` (nats); the damping's first value and the one at which it gives up; the bounds (m) of width and
+    height; and the least blur (m) that the information is asked with: a jump has none.
+    """
+
+    blurs: FloatArray
+    iterations: int
+    tolerance: float
+    first_damping: float
+    max_damping: float
+    min_size: float
+    max_size: float
+    information_blur: float
 
 
 @lru_cache(maxsize=1)
 def _normal() -> tuple[NDArray[np.float64], ...]:
-    """X as the tables have it, exp(-x²/2), and Phi(-x)."""
+    """Return the tables' x, exp(-x²/2), and Phi(-x)."""
     x = np.arange(-TABLE_REACH * TABLE_SPACING, TABLE_REACH * TABLE_SPACING + 1) / TABLE_SPACING
     return x, np.exp(-(x**2) / 2), np.array([0.5 * math.erfc(value / math.sqrt(2)) for value in x])
 
 
-def not_below(cut: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The chance (N,) that a standard normal number is not below each ``cut``."""
+def upper_tail(cut: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the probability (N,) that a standard normal variable exceeds each ``cut`` (N,)."""
     x, _, above = _normal()
     return np.interp(cut, x, above)
 
 
-def tables(outlier: float) -> NDArray[np.float64]:
-    """Log-likelihoods (rows 0 to 2) and their slopes (rows 3 to 5) over x = (r - z) / sigma; r is where a ray ends.
+def likelihood_table(outlier: float) -> FloatArray:
+    """Tabulate the log-likelihood of a beam and its derivative over x = (r - z) / sigma, r the range to the surface.
 
-    Row MEASURED: log(exp(-x²/2) + outlier), the density in units of its peak; TOO_NEAR: log(Phi(-x) + outlier), z the
-    sensor's least range; NO_RETURN: log(Phi(x) + outlier), z its largest.
+    Row MEASURED: log(exp(-x²/2) + outlier), the density in units of its peak. TOO_NEAR: log(Phi(-x) + outlier), z the
+    sensor's range_min. NO_RETURN: log(Phi(x) + outlier), z its range_max. Rows 3 to 5 are their derivatives by x.
+
+    Args:
+        outlier: the density of outliers in units of the Gaussian's peak.
+
+    Returns:
+        (6, 2 * TABLE_REACH * TABLE_SPACING + 1).
     """
     x, density, below = _normal()
     phi = density / math.sqrt(2 * math.pi)
@@ -97,8 +169,8 @@ def tables(outlier: float) -> NDArray[np.float64]:
 
 
 @part
-def looked_up(table: Any, row: int, x: float) -> float:
-    """A row of the table at x, linear between its entries."""
+def lookup(table: Any, row: int, x: float) -> float:
+    """Interpolate a row of the table linearly at x."""
     place = (min(max(x, -TABLE_REACH), TABLE_REACH) + TABLE_REACH) * TABLE_SPACING
     entry = min(int(place), 2 * int(TABLE_REACH) * TABLE_SPACING - 1)
     low = float(table[row, entry])
@@ -106,13 +178,15 @@ def looked_up(table: Any, row: int, x: float) -> float:
 
 
 @part
-def entry(family: int, lx: float, ly: float, ux: float, uy: float) -> tuple[float, float, float]:
-    """Where the line l + t u enters a unit shape: t (below 0 from inside), and the outward normal there.
+def enter_form(form: int, lx: float, ly: float, ux: float, uy: float) -> tuple[float, float, float]:
+    """Intersect the line l + t u with the unit outline of a form.
 
-    FAR where it does not meet the shape, BEHIND where the shape lies behind l.
+    Returns:
+        t at the entry (below 0 from inside) and the outward normal there; t is FAR for a miss, BEHIND where the
+        outline lies behind l.
     """
     t, nx, ny = -FAR, 0.0, 0.0
-    if family == DISC:
+    if form == ROUND:
         square, half = ux * ux + uy * uy, ux * lx + uy * ly
         inside = half * half - square * (lx * lx + ly * ly - 1.0)
         if inside < 0:
@@ -123,7 +197,7 @@ def entry(family: int, lx: float, ly: float, ux: float, uy: float) -> tuple[floa
         t = (-half - root) / square
         return t, lx + t * ux, ly + t * uy
     leave = FAR
-    if family == BOX:
+    if form == BOX:
         along = 1.0 / ux if ux != 0.0 else ENDLESS
         across = 1.0 / uy if uy != 0.0 else ENDLESS
         near_x, far_x = -0.5 * abs(along) - lx * along, 0.5 * abs(along) - lx * along
@@ -137,7 +211,7 @@ def entry(family: int, lx: float, ly: float, ux: float, uy: float) -> tuple[floa
         for edge in range(3):
             ex, ey = EDGE_X[edge], EDGE_Y[edge]
             towards = ex * ux + ey * uy
-            gap = EDGE_AT[edge] - ex * lx - ey * ly
+            gap = EDGE_OFFSET[edge] - ex * lx - ey * ly
             crossing = gap / towards if towards != 0.0 else (ENDLESS if gap >= 0 else -ENDLESS)
             if towards < 0:
                 if crossing > t:
@@ -152,12 +226,34 @@ def entry(family: int, lx: float, ly: float, ux: float, uy: float) -> tuple[floa
 
 
 @part
-def extreme(family: int, mx: float, my: float) -> tuple[float, float]:
-    """The point of a unit shape that lies farthest along (mx, my)."""
-    if family == DISC:
+def enter_polygon(outline: Any, lx: float, ly: float, ux: float, uy: float) -> tuple[float, float, float]:
+    """As :func:`enter_form`, of a polygon: ``outline`` is the outlines and the kind's number."""
+    outlines, k = outline
+    t, nx, ny, leave = -FAR, 0.0, 0.0, FAR
+    for edge in range(outlines.corners[k]):
+        ex, ey = outlines.normals[k, edge, 0], outlines.normals[k, edge, 1]
+        towards = ex * ux + ey * uy
+        gap = outlines.offsets[k, edge] - ex * lx - ey * ly
+        crossing = gap / towards if towards != 0.0 else (ENDLESS if gap >= 0 else -ENDLESS)
+        if towards < 0:
+            if crossing > t:
+                t, nx, ny = crossing, ex, ey
+        else:
+            leave = min(leave, crossing)
+    if t > leave:
+        return FAR, 0.0, 0.0
+    if leave < 0:
+        return BEHIND, 0.0, 0.0
+    return t, nx, ny
+
+
+@part
+def form_support(form: int, mx: float, my: float) -> tuple[float, float]:
+    """Return the point of a form's unit outline that is farthest along (mx, my)."""
+    if form == ROUND:
         length = math.sqrt(mx * mx + my * my)
         return mx / length, my / length
-    if family == BOX:
+    if form == BOX:
         return (0.5 if mx >= 0 else -0.5), (0.5 if my >= 0 else -0.5)
     low, high = 0.5 * abs(mx) - my / 3.0, 2.0 * my / 3.0
     if high >= low:
@@ -166,10 +262,24 @@ def extreme(family: int, mx: float, my: float) -> tuple[float, float]:
 
 
 @part
-def slide(sign: float, ax: float, ay: float, bx: float, by: float, width: float, height: float, dr: Any) -> None:
-    """How the distance to an ellipse's silhouette changes with its angle and axes: its point slides on the outline.
+def polygon_support(outline: Any, mx: float, my: float) -> tuple[float, float]:
+    """As :func:`form_support`, of a polygon."""
+    outlines, k = outline
+    farthest, reach = 0, -FAR
+    for corner in range(outlines.corners[k]):
+        along = mx * outlines.vertices[k, corner, 0] + my * outlines.vertices[k, corner, 1]
+        if along > reach:
+            farthest, reach = corner, along
+    return outlines.vertices[k, farthest, 0], outlines.vertices[k, farthest, 1]
 
-    (ax, ay) is the ray's normal and (bx, by) its direction in the ellipse's own frame; ``sign`` tells the side.
+
+@part
+def silhouette_range_gradient(
+    sign: float, ax: float, ay: float, bx: float, by: float, width: float, height: float, dr: Any
+) -> None:
+    """Set the derivatives of the range to an ellipse's silhouette point, which slides along the outline.
+
+    (ax, ay) is the ray's normal and (bx, by) its direction in the ellipse's own frame; ``sign`` is the side.
     """
     reach = math.sqrt((width * ax) ** 2 + (height * ay) ** 2)
     along = width * width * ax * bx + height * height * ay * by
@@ -180,69 +290,110 @@ def slide(sign: float, ax: float, ay: float, bx: float, by: float, width: float,
 
 
 @part
-def told_by(
-    family: int, p: Any, cos: float, sin: float, beams: Any, i: int, blur: float, dr: Any, ds: Any
-) -> tuple[float, float]:
-    """Where ray ``i`` meets a shape (r) and by how much it hits it (s), both in metres, with derivatives by p.
-
-    Where s is below -blur nothing else is set. A ray that misses by less has the r of the silhouette's point.
-    """
-    dx, dy = beams[DIRECTION_X, i], beams[DIRECTION_Y, i]
-    ox, oy = beams[ORIGIN_X, i] - p[X], beams[ORIGIN_Y, i] - p[Y]
-    width, height = p[WIDTH], p[HEIGHT]
-    nx, ny = -dy, dx
-    ax, ay = cos * nx + sin * ny, cos * ny - sin * nx
-    mx, my = width * ax, height * ay
-    offset = ox * nx + oy * ny
-    qx, qy = extreme(family, mx, my)
-    above = mx * qx + my * qy - offset
-    sx, sy = extreme(family, -mx, -my)
-    below = offset - mx * sx - my * sy
-    sign, s = 1.0, above
-    if below < above:
-        sign, s, qx, qy = -1.0, below, sx, sy
-    if s < -blur:
-        return 0.0, s
-    tx, ty = width * qx, height * qy
-    px, py = cos * tx - sin * ty, sin * tx + cos * ty
-    ds[X], ds[Y] = sign * nx, sign * ny
-    ds[THETA] = sign * (ny * px - nx * py)
-    ds[WIDTH], ds[HEIGHT] = sign * ax * qx, sign * ay * qy
-    lx, ly = (cos * ox + sin * oy) / width, (cos * oy - sin * ox) / height
-    ux, uy = (cos * dx + sin * dy) / width, (cos * dy - sin * dx) / height
-    t, gx, gy = FAR, 0.0, 0.0
-    if s > 0:
-        t, gx, gy = entry(family, lx, ly, ux, uy)
-    if t == BEHIND:
-        return 0.0, -FAR
-    if t == FAR:
-        bx, by = cos * dx + sin * dy, cos * dy - sin * dx
-        dr[X], dr[Y] = dx, dy
-        dr[THETA] = dy * px - dx * py
-        dr[WIDTH], dr[HEIGHT] = bx * qx, by * qy
-        if family == DISC:
-            slide(sign, ax, ay, bx, by, width, height, dr)
-        return (px - ox) * dx + (py - oy) * dy, s
-    hx, hy = lx + t * ux, ly + t * uy
-    scale = 1.0 / (gx * ux + gy * uy)
-    dr[X] = (gx * cos / width - gy * sin / height) * scale
-    dr[Y] = (gx * sin / width + gy * cos / height) * scale
-    dr[THETA] = (gy * width * hx / height - gx * height * hy / width) * scale
-    dr[WIDTH], dr[HEIGHT] = gx * hx / width * scale, gy * hy / height * scale
-    return t, s
+def form_is_round(form: int) -> bool:
+    """Return whether a form is the disc."""
+    return form == ROUND
 
 
 @part
-def meet(family: int, p: Any, beams: Any, first: int, count: int, r: Any, s: Any) -> None:
-    """As :func:`told_by` of ``count`` rays from the ``first`` on, without derivatives: several rays at once.
+def polygon_is_round(outline: Any) -> bool:
+    """No polygon is round."""
+    return False
 
-    s is -FAR where the shape lies behind a ray. There are no branches here, so that compilers can use vectors.
+
+def _intersection(support: Any, enter: Any, is_round: Any) -> Any:
+    """Make the intersection of one ray with a shape, with derivatives, of the unit outline's three properties.
+
+    The function that is made takes
+
+    - outline: what the properties take first,
+    - p: (5,) parameters,
+    - heading: cosine and sine of theta,
+    - rays: (7, N),
+    - i: which ray,
+    - blur: (m),
+    - gradients: two arrays (5,) that get the derivatives by p of the range and of the clearance,
+
+    and returns the range (m) and the clearance (m). Where the clearance is below -blur, no derivative is set. A ray
+    that misses by less has the range of the silhouette's point.
+
+    Args:
+        support: the support point of the unit outline along a direction.
+        enter: where a line enters it.
+        is_round: whether its silhouette's point slides along it.
+
+    Returns:
+        The compiled function.
+    """
+
+    def intersect_with_gradient(
+        outline: Any, p: Any, heading: Any, rays: Any, i: int, blur: float, gradients: Any
+    ) -> tuple[float, float]:
+        dr, ds = gradients
+        cos, sin = heading
+        dx, dy = rays[DIRECTION_X, i], rays[DIRECTION_Y, i]
+        ox, oy = rays[ORIGIN_X, i] - p[X], rays[ORIGIN_Y, i] - p[Y]
+        width, height = p[WIDTH], p[HEIGHT]
+        nx, ny = -dy, dx
+        ax, ay = cos * nx + sin * ny, cos * ny - sin * nx
+        mx, my = width * ax, height * ay
+        offset = ox * nx + oy * ny
+        qx, qy = support(outline, mx, my)
+        above = mx * qx + my * qy - offset
+        sx, sy = support(outline, -mx, -my)
+        below = offset - mx * sx - my * sy
+        sign, s = 1.0, above
+        if below < above:
+            sign, s, qx, qy = -1.0, below, sx, sy
+        if s < -blur:
+            return 0.0, s
+        tx, ty = width * qx, height * qy
+        px, py = cos * tx - sin * ty, sin * tx + cos * ty
+        ds[X], ds[Y] = sign * nx, sign * ny
+        ds[THETA] = sign * (ny * px - nx * py)
+        ds[WIDTH], ds[HEIGHT] = sign * ax * qx, sign * ay * qy
+        lx, ly = (cos * ox + sin * oy) / width, (cos * oy - sin * ox) / height
+        ux, uy = (cos * dx + sin * dy) / width, (cos * dy - sin * dx) / height
+        t, gx, gy = FAR, 0.0, 0.0
+        if s > 0:
+            t, gx, gy = enter(outline, lx, ly, ux, uy)
+        if t == BEHIND:
+            return 0.0, -FAR
+        if t == FAR:
+            bx, by = cos * dx + sin * dy, cos * dy - sin * dx
+            dr[X], dr[Y] = dx, dy
+            dr[THETA] = dy * px - dx * py
+            dr[WIDTH], dr[HEIGHT] = bx * qx, by * qy
+            if is_round(outline):
+                silhouette_range_gradient(sign, ax, ay, bx, by, width, height, dr)
+            return (px - ox) * dx + (py - oy) * dy, s
+        hx, hy = lx + t * ux, ly + t * uy
+        scale = 1.0 / (gx * ux + gy * uy)
+        dr[X] = (gx * cos / width - gy * sin / height) * scale
+        dr[Y] = (gx * sin / width + gy * cos / height) * scale
+        dr[THETA] = (gy * width * hx / height - gx * height * hy / width) * scale
+        dr[WIDTH], dr[HEIGHT] = gx * hx / width * scale, gy * hy / height * scale
+        return t, s
+
+    return part(intersect_with_gradient)
+
+
+form_with_gradient = _intersection(form_support, enter_form, form_is_round)
+polygon_with_gradient = _intersection(polygon_support, enter_polygon, polygon_is_round)
+
+
+@part
+def intersect_form(form: int, p: Any, rays: Any, first: int, count: int, ranges: Any, clearances: Any) -> None:
+    """Intersect ``count`` <= BLOCK rays from the ``first`` on with a shape of a form, without derivatives.
+
+    The clearance is -FAR where the shape lies behind a ray. Loops over rays have no branches, so that compilers can
+    vectorise them.
     """
     cos, sin = math.cos(p[THETA]), math.sin(p[THETA])
     x, y, width, height = p[X], p[Y], p[WIDTH], p[HEIGHT]
     to_x, to_y = 1.0 / width, 1.0 / height
-    origin_x, origin_y = beams[ORIGIN_X, first : first + count], beams[ORIGIN_Y, first : first + count]
-    towards_x, towards_y = beams[DIRECTION_X, first : first + count], beams[DIRECTION_Y, first : first + count]
+    origin_x, origin_y = rays[ORIGIN_X, first : first + count], rays[ORIGIN_Y, first : first + count]
+    towards_x, towards_y = rays[DIRECTION_X, first : first + count], rays[DIRECTION_Y, first : first + count]
     for i in range(count):
         dx, dy = towards_x[i], towards_y[i]
         ox, oy = origin_x[i] - x, origin_y[i] - y
@@ -251,7 +402,7 @@ def meet(family: int, p: Any, beams: Any, first: int, count: int, r: Any, s: Any
         mx, my = -width * by, height * bx
         offset = oy * dx - ox * dy
         ahead = -(ox * dx + oy * dy)
-        if family == BOX:
+        if form == BOX:
             side = 1.0 if offset >= 0.0 else -1.0
             beside = 0.5 * (abs(mx) + abs(my)) - abs(offset)
             qx, qy = (side if mx >= 0.0 else -side), (side if my >= 0.0 else -side)
@@ -260,7 +411,7 @@ def meet(family: int, p: Any, beams: Any, first: int, count: int, r: Any, s: Any
             across = 1.0 / uy if uy != 0.0 else ENDLESS
             enter = max(-0.5 * abs(along) - lx * along, -0.5 * abs(across) - ly * across)
             leave = min(0.5 * abs(along) - lx * along, 0.5 * abs(across) - ly * across)
-        elif family == DISC:
+        elif form == ROUND:
             side = 1.0 if offset >= 0.0 else -1.0
             length = math.sqrt(mx * mx + my * my)
             beside = length - abs(offset)
@@ -282,17 +433,89 @@ def meet(family: int, p: Any, beams: Any, first: int, count: int, r: Any, s: Any
             for edge in range(3):
                 ex, ey = EDGE_X[edge], EDGE_Y[edge]
                 into = ex * ux + ey * uy
-                crossing = (EDGE_AT[edge] - ex * lx - ey * ly) / (into if into != 0.0 else 1.0)
+                crossing = (EDGE_OFFSET[edge] - ex * lx - ey * ly) / (into if into != 0.0 else 1.0)
                 enter = max(enter, crossing if into < 0.0 else -FAR)
                 leave = min(leave, crossing if into > 0.0 else FAR)
         hits = beside > 0.0
-        r[i] = enter if hits else past
-        s[i] = -FAR if hits and leave < 0.0 else beside
+        ranges[i] = enter if hits else past
+        clearances[i] = -FAR if hits and leave < 0.0 else beside
 
 
 @part
-def turn_with(family: int, p: Any, rays: Any, count: int, dr: Any) -> None:
-    """The derivatives ``dr`` (5, count) by p of the distances to a shape that all ``rays`` (4, count) hit.
+def to_outline(p: Any, rays: Any, i: int, cos: float, sin: float) -> tuple[float, float, float, float, float, float]:
+    """Return a ray in the unit outline's frame (origin, direction), and its direction in the shape's own frame."""
+    dx, dy = rays[DIRECTION_X, i], rays[DIRECTION_Y, i]
+    ox, oy = rays[ORIGIN_X, i] - p[X], rays[ORIGIN_Y, i] - p[Y]
+    bx, by = cos * dx + sin * dy, cos * dy - sin * dx
+    to_x, to_y = 1.0 / p[WIDTH], 1.0 / p[HEIGHT]
+    return (cos * ox + sin * oy) * to_x, (cos * oy - sin * ox) * to_y, bx * to_x, by * to_y, bx, by
+
+
+@part
+def intersect_polygon(
+    outlines: Any, k: int, p: Any, rays: Any, first: int, count: int, ranges: Any, clearances: Any, scratch: Any
+) -> None:
+    """As :func:`intersect_form`, for a convex polygon: edge by edge, and vertex by vertex, over all rays.
+
+    A line misses a polygon exactly if all vertices lie on one side of it; it enters at the last of the crossings with
+    edges that face it, and leaves at the first of the others (Cyrus and Beck 1978).
+    """
+    cos, sin = math.cos(p[THETA]), math.sin(p[THETA])
+    width, height = p[WIDTH], p[HEIGHT]
+    for i in range(count):
+        lx, ly, ux, uy, bx, by = to_outline(p, rays, first + i, cos, sin)
+        scratch[LX, i], scratch[LY, i], scratch[UX, i], scratch[UY, i] = lx, ly, ux, uy
+        scratch[MX, i], scratch[MY, i], scratch[BX, i], scratch[BY, i] = (
+            -width * by,
+            height * bx,
+            width * bx,
+            height * by,
+        )
+        scratch[HIGH, i], scratch[LOW, i], scratch[AT_HIGH, i], scratch[AT_LOW, i] = -FAR, FAR, 0.0, 0.0
+        ranges[i], clearances[i] = -FAR, FAR
+    for corner in range(outlines.corners[k]):
+        vx, vy = outlines.vertices[k, corner, 0], outlines.vertices[k, corner, 1]
+        for i in range(count):
+            aside = vx * scratch[MX, i] + vy * scratch[MY, i]
+            along = vx * scratch[BX, i] + vy * scratch[BY, i]
+            higher, lower = aside > scratch[HIGH, i], aside < scratch[LOW, i]
+            scratch[HIGH, i] = aside if higher else scratch[HIGH, i]
+            scratch[AT_HIGH, i] = along if higher else scratch[AT_HIGH, i]
+            scratch[LOW, i] = aside if lower else scratch[LOW, i]
+            scratch[AT_LOW, i] = along if lower else scratch[AT_LOW, i]
+    for edge in range(outlines.corners[k]):
+        ex, ey, offset = outlines.normals[k, edge, 0], outlines.normals[k, edge, 1], outlines.offsets[k, edge]
+        for i in range(count):  # ranges and clearances hold the entries and the exits meanwhile
+            into = ex * scratch[UX, i] + ey * scratch[UY, i]
+            crossing = (offset - ex * scratch[LX, i] - ey * scratch[LY, i]) / (into if into != 0.0 else 1.0)
+            ranges[i] = max(ranges[i], crossing if into < 0.0 else -FAR)
+            clearances[i] = min(clearances[i], crossing if into > 0.0 else FAR)
+    for i in range(count):
+        dx, dy = rays[DIRECTION_X, first + i], rays[DIRECTION_Y, first + i]
+        ox, oy = rays[ORIGIN_X, first + i] - p[X], rays[ORIGIN_Y, first + i] - p[Y]
+        offset = oy * dx - ox * dy
+        above, below = scratch[HIGH, i] - offset, offset - scratch[LOW, i]
+        beside = min(above, below)
+        past = -(ox * dx + oy * dy) + (scratch[AT_LOW, i] if below < above else scratch[AT_HIGH, i])
+        hits, behind = beside > 0.0, clearances[i] < 0.0
+        ranges[i] = ranges[i] if hits else past
+        clearances[i] = -FAR if hits and behind else beside
+
+
+@part
+def intersect(
+    outlines: Any, k: int, p: Any, rays: Any, first: int, count: int, ranges: Any, clearances: Any, scratch: Any
+) -> None:
+    """Intersect a block of rays with a shape of kind ``k``."""
+    if outlines.form[k] == POLYGON:
+        intersect_polygon(outlines, k, p, rays, first, count, ranges, clearances, scratch)
+    else:
+        intersect_form(outlines.form[k], p, rays, first, count, ranges, clearances)
+
+
+@part
+def range_gradients(form: int, p: Any, rays: Any, count: int, dr: Any) -> None:
+    """Set the derivatives ``dr`` (5, count) by p of the ranges to a shape that all ``rays`` (4, count) hit.
 
     As the outline moves along its normal, so does the point where a ray enters it, along the ray.
     """
@@ -304,7 +527,7 @@ def turn_with(family: int, p: Any, rays: Any, count: int, dr: Any) -> None:
         ox, oy = rays[ORIGIN_X, i] - x, rays[ORIGIN_Y, i] - y
         lx, ly = (cos * ox + sin * oy) * to_x, (cos * oy - sin * ox) * to_y
         ux, uy = (cos * dx + sin * dy) * to_x, (cos * dy - sin * dx) * to_y
-        if family == BOX:
+        if form == BOX:
             along = 1.0 / ux if ux != 0.0 else ENDLESS
             across = 1.0 / uy if uy != 0.0 else ENDLESS
             near_x, near_y = -0.5 * abs(along) - lx * along, -0.5 * abs(across) - ly * across
@@ -312,7 +535,7 @@ def turn_with(family: int, p: Any, rays: Any, count: int, dr: Any) -> None:
             enter = max(near_x, near_y)
             gx = (-1.0 if ux > 0.0 else 1.0) if by_x else 0.0
             gy = 0.0 if by_x else (-1.0 if uy > 0.0 else 1.0)
-        elif family == DISC:
+        elif form == ROUND:
             square, half = ux * ux + uy * uy, ux * lx + uy * ly
             root = math.sqrt(max(half * half - square * (lx * lx + ly * ly - 1.0), 0.0))
             enter = (-half - root) / square
@@ -322,7 +545,7 @@ def turn_with(family: int, p: Any, rays: Any, count: int, dr: Any) -> None:
             for edge in range(3):
                 ex, ey = EDGE_X[edge], EDGE_Y[edge]
                 into = ex * ux + ey * uy
-                crossing = (EDGE_AT[edge] - ex * lx - ey * ly) / (into if into != 0.0 else 1.0)
+                crossing = (EDGE_OFFSET[edge] - ex * lx - ey * ly) / (into if into != 0.0 else 1.0)
                 later = into < 0.0 and crossing > enter
                 enter, gx, gy = (crossing if later else enter), (ex if later else gx), (ey if later else gy)
         hx, hy = lx + enter * ux, ly + enter * uy
@@ -334,8 +557,36 @@ def turn_with(family: int, p: Any, rays: Any, count: int, dr: Any) -> None:
 
 
 @part
-def share_hit(s: float, blur: float) -> float:
-    """How much of a ray's footprint hits: 0 at -blur, 1 at blur, smooth in between."""
+def polygon_range_gradients(outlines: Any, k: int, p: Any, rays: Any, count: int, dr: Any, scratch: Any) -> None:
+    """As :func:`range_gradients`, for a convex polygon."""
+    cos, sin = math.cos(p[THETA]), math.sin(p[THETA])
+    width, height = p[WIDTH], p[HEIGHT]
+    for i in range(count):
+        lx, ly, ux, uy, _, _ = to_outline(p, rays, i, cos, sin)
+        scratch[LX, i], scratch[LY, i], scratch[UX, i], scratch[UY, i] = lx, ly, ux, uy
+        scratch[ENTER, i], scratch[NX, i], scratch[NY, i] = -FAR, 0.0, 0.0
+    for edge in range(outlines.corners[k]):
+        ex, ey, offset = outlines.normals[k, edge, 0], outlines.normals[k, edge, 1], outlines.offsets[k, edge]
+        for i in range(count):
+            into = ex * scratch[UX, i] + ey * scratch[UY, i]
+            crossing = (offset - ex * scratch[LX, i] - ey * scratch[LY, i]) / (into if into != 0.0 else 1.0)
+            later = into < 0.0 and crossing > scratch[ENTER, i]
+            scratch[ENTER, i] = crossing if later else scratch[ENTER, i]
+            scratch[NX, i] = ex if later else scratch[NX, i]
+            scratch[NY, i] = ey if later else scratch[NY, i]
+    for i in range(count):
+        ux, uy, gx, gy = scratch[UX, i], scratch[UY, i], scratch[NX, i], scratch[NY, i]
+        hx, hy = scratch[LX, i] + scratch[ENTER, i] * ux, scratch[LY, i] + scratch[ENTER, i] * uy
+        scale = 1.0 / (gx * ux + gy * uy)
+        nx, ny = gx / width * scale, gy / height * scale
+        dr[X, i], dr[Y, i] = nx * cos - ny * sin, nx * sin + ny * cos
+        dr[THETA, i] = ny * width * hx - nx * height * hy
+        dr[WIDTH, i], dr[HEIGHT, i] = nx * hx, ny * hy
+
+
+@part
+def hit_fraction(s: float, blur: float) -> float:
+    """Return the share of a ray's footprint that hits at clearance s: a cubic step from 0 at -blur to 1 at blur."""
     if s >= blur:
         return 1.0
     if s <= -blur:
@@ -345,97 +596,111 @@ def share_hit(s: float, blur: float) -> float:
 
 
 @kernel
-def keep_passing(
-    directions: Any,
-    kinds: Any,
-    z: Any,
-    pose: Any,
-    circle: Any,
-    of_scan: Any,
-    rays: Any,
-    ray_kinds: Any,
-    scan: Any,
-    size: int,
+def append_passing(
+    directions: Any, outcomes: Any, z: Any, pose: Any, circle: Any, scan: Any, store: Any, size: int
 ) -> int:
-    """Adds a scan's beams that say something and come near a ``circle`` (x, y, radius) to ``size`` others.
+    """Append a scan's valid beams that pass near a circle to the rays of a :class:`RayStoreView`.
 
-    ``directions`` (N, 2) are in the laser's frame, ``pose`` (x, y, theta) is the laser's, ``of_scan`` its largest
-    range (m) and its number. ``rays`` (ROWS, room), ``ray_kinds`` and ``scan`` (room,) get what is added; returns how
-    many there are then.
+    Args:
+        directions: (N, 2) unit vectors in the laser's frame.
+        outcomes: (N,) MEASURED, TOO_NEAR, NO_RETURN or INVALID.
+        z: (N,) ranges, or the limits that they are beyond (m).
+        pose: of the laser: x, y (m), theta (rad).
+        circle: x, y, radius (m).
+        scan: the scan's largest range (m) and its number.
+        store: what they are appended to, with room for N more.
+        size: how many rays it holds.
+
+    Returns:
+        How many rays it holds now.
     """
     cos, sin = math.cos(pose[2]), math.sin(pose[2])
     away_x, away_y, reach = circle[0] - pose[0], circle[1] - pose[1], circle[2]
-    for i in range(len(kinds)):
+    rays = store.rays
+    for i in range(len(outcomes)):
         dx = cos * directions[i, 0] - sin * directions[i, 1]
         dy = sin * directions[i, 0] + cos * directions[i, 1]
         ahead = dx * away_x + dy * away_y
-        if abs(dx * away_y - dy * away_x) < reach and ahead > -reach and kinds[i] != SAYS_NOTHING:
+        if abs(dx * away_y - dy * away_x) < reach and ahead > -reach and outcomes[i] != INVALID:
             rays[ORIGIN_X, size], rays[ORIGIN_Y, size] = pose[0], pose[1]
             rays[DIRECTION_X, size], rays[DIRECTION_Y, size] = dx, dy
-            rays[RANGE, size], rays[NEAR, size], rays[LIMIT, size] = z[i], ahead - reach, of_scan[0]
-            ray_kinds[size], scan[size] = kinds[i], of_scan[1]
+            rays[RANGE, size], rays[NEAREST, size], rays[MAX_RANGE, size] = z[i], ahead - reach, scan[0]
+            store.outcomes[size], store.scan[size] = outcomes[i], scan[1]
             size += 1
     return size
 
 
 @kernel
-def stop_at(family: int, p: Any, reach: float, beams: Any) -> None:
-    """Cuts the STOP of beams down to where they meet a shape, all of which lies within ``reach`` (m) of its place."""
-    r, s = np.empty(BLOCK), np.empty(BLOCK)
-    size = beams.shape[1]
+def occlude(outlines: Any, k: int, p: Any, reach: float, rays: Any) -> None:
+    """Lower the OCCLUSION of rays (7, N) to where they meet a shape of circumradius ``reach`` (m)."""
+    ranges, clearances, scratch = np.empty(BLOCK), np.empty(BLOCK), np.empty((SCRATCH_ROWS, BLOCK))
+    size = rays.shape[1]
     for first in range(0, size, BLOCK):
         count = min(BLOCK, size - first)
         passes = False
         for i in range(first, first + count):
-            away_x, away_y = p[X] - beams[ORIGIN_X, i], p[Y] - beams[ORIGIN_Y, i]
-            passes |= abs(away_x * beams[DIRECTION_Y, i] - away_y * beams[DIRECTION_X, i]) < reach
+            away_x, away_y = p[X] - rays[ORIGIN_X, i], p[Y] - rays[ORIGIN_Y, i]
+            passes |= abs(away_x * rays[DIRECTION_Y, i] - away_y * rays[DIRECTION_X, i]) < reach
         if passes:
-            meet(family, p, beams, first, count, r, s)
+            intersect(outlines, k, p, rays, first, count, ranges, clearances, scratch)
             for i in range(count):
-                if s[i] > 0 and r[i] < beams[STOP, first + i]:
-                    beams[STOP, first + i] = max(r[i], 0.0)
+                if clearances[i] > 0 and ranges[i] < rays[OCCLUSION, first + i]:
+                    rays[OCCLUSION, first + i] = max(ranges[i], 0.0)
 
 
 @kernel
-def shade(beams: Any, kinds: Any, behind: Any, blocked: Any, sigma: float, table: Any) -> None:
-    """Has beams that something stops before what is ``behind`` (N,) in the map say what they say of that (MISS).
+def apply_occlusion(data: Any, background: Any, blocked: Any) -> None:
+    """Set the BACKGROUND log-likelihood of rays that another surface occludes before the background.
 
-    What is ``blocked`` (N,) in the map before it comes near stops at once.
+    Args:
+        data: the :class:`RayData`, changed in place.
+        background: (N,) ranges (m) to the map's surface behind the shape.
+        blocked: (N,) whether the map blocks a ray before it comes near; its OCCLUSION becomes 0.
     """
-    for i in range(len(kinds)):
-        if beams[STOP, i] < behind[i]:
-            beams[MISS, i] = looked_up(table, kinds[i], (beams[STOP, i] - beams[RANGE, i]) / sigma)
+    rays, outcomes, sigma, table = data
+    for i in range(len(outcomes)):
+        if rays[OCCLUSION, i] < background[i]:
+            rays[BACKGROUND, i] = lookup(table, outcomes[i], (rays[OCCLUSION, i] - rays[RANGE, i]) / sigma)
         if blocked[i]:
-            beams[STOP, i] = 0.0
+            rays[OCCLUSION, i] = 0.0
 
 
 @kernel
-def pass_by(family: int, p: Any, beams: Any, out: Any) -> None:
-    """By how much (N,) the lines of beams hit a shape (m), below 0 for a miss; -FAR where it lies behind them."""
-    meet(family, p, beams, 0, len(out), np.empty(len(out)), out)
+def silhouette_clearances(outlines: Any, k: int, p: Any, rays: Any, out: Any) -> None:
+    """Set the clearances (N,) of rays (m): below 0 for a miss, -FAR where the shape lies behind."""
+    ranges, scratch = np.empty(BLOCK), np.empty((SCRATCH_ROWS, BLOCK))
+    for first in range(0, len(out), BLOCK):
+        count = min(BLOCK, len(out) - first)
+        intersect(outlines, k, p, rays, first, count, ranges, out[first:], scratch)
 
 
 @kernel
-def trace(family: int, p: Any, beams: Any, out: Any) -> None:
-    """Distances (N,) of beams to a shape, FAR for a miss; 0 from inside."""
-    s = np.empty(len(out))
-    meet(family, p, beams, 0, len(out), out, s)
-    for i in range(len(out)):
-        out[i] = max(out[i], 0.0) if s[i] > 0 else FAR
+def cast_rays(outlines: Any, k: int, p: Any, rays: Any, out: Any) -> None:
+    """Set the ranges (N,) of rays to a shape (m): FAR for a miss, 0 from inside."""
+    clearances, scratch = np.empty(BLOCK), np.empty((SCRATCH_ROWS, BLOCK))
+    for first in range(0, len(out), BLOCK):
+        count = min(BLOCK, len(out) - first)
+        intersect(outlines, k, p, rays, first, count, out[first:], clearances, scratch)
+        for i in range(count):
+            out[first + i] = max(out[first + i], 0.0) if clearances[i] > 0 else FAR
 
 
 @kernel
-def margins(family: int, p: Any, covariance: Any, beams: Any, blur: float, out: Any) -> None:
-    """By how many standard deviations (N,) beams hit a shape whose parameters have a ``covariance`` (5, 5).
+def standardized_clearances(outlines: Any, k: int, p: Any, covariance: Any, rays: Any, blur: float, out: Any) -> None:
+    """Set the clearances (N,) of rays in standard deviations, for a shape whose parameters have a covariance (5, 5).
 
-    Below 0 for a miss, 0 where its footprint of half-width ``blur`` (m) meets an edge. A beam that something else
-    stops before it comes to the shape misses it for certain.
+    Below 0 for a miss, 0 where the footprint of half-width ``blur`` (m) meets an edge. A ray that is occluded before
+    it comes to the shape misses it for certain (-FAR).
     """
-    cos, sin = math.cos(p[THETA]), math.sin(p[THETA])
+    heading = math.cos(p[THETA]), math.sin(p[THETA])
+    form = outlines.form[k]
     dr, ds = np.zeros(PARAMETERS), np.zeros(PARAMETERS)
     for i in range(len(out)):
-        r, s = told_by(family, p, cos, sin, beams, i, FAR, dr, ds)
-        if r >= beams[STOP, i] or s == -FAR:
+        if form == POLYGON:
+            r, s = polygon_with_gradient((outlines, k), p, heading, rays, i, FAR, (dr, ds))
+        else:
+            r, s = form_with_gradient(form, p, heading, rays, i, FAR, (dr, ds))
+        if r >= rays[OCCLUSION, i] or s == -FAR:
             out[i] = -FAR
             continue
         variance = 1e-12
@@ -447,144 +712,169 @@ def margins(family: int, p: Any, covariance: Any, beams: Any, blur: float, out: 
 
 
 @part
-def hits_and_edges(beams: Any, first: int, count: int, r: Any, s: Any, blur: float, hits: Any, edges: Any) -> Any:
-    """Which of some beams hit a shape with all of their footprint, and which with a part of it: their numbers.
+def partition(
+    rays: Any, first: int, ranges: Any, clearances: Any, blur: float, hits: Any, edges: Any, count: int
+) -> Any:
+    """Find which rays of a block hit a shape with all of their footprint, and which with a part of it.
 
-    ``r`` and ``s`` are as :func:`meet` leaves them. Returns how many hit, how many do in part, and what all others
-    are likely by (nats).
+    ``ranges`` and ``clearances`` are as :func:`intersect` leaves them; ``hits`` and ``edges`` get the indices.
+    Returns how many hit, how many do in part, and the background's log-likelihood of all others.
     """
-    stops, misses = beams[STOP, first : first + count], beams[MISS, first : first + count]
+    occlusions, backgrounds = rays[OCCLUSION, first : first + count], rays[BACKGROUND, first : first + count]
     hit, edge, missed = 0, 0, 0.0
     for i in range(count):
-        stopped = r[i] >= stops[i]
-        full, some = s[i] >= blur and s[i] > 0.0 and not stopped, s[i] > -blur and not stopped
+        occluded = ranges[i] >= occlusions[i]
+        full, some = (
+            clearances[i] >= blur and clearances[i] > 0.0 and not occluded,
+            clearances[i] > -blur and not occluded,
+        )
         hits[hit] = i
         hit += full
         edges[edge] = i
         edge += some and not full
-        missed += 0.0 if full or some else misses[i]
+        missed += 0.0 if full or some else backgrounds[i]
     return hit, edge, missed
 
 
 @kernel
-def costs(
-    families: Any, samples: Any, beams: Any, kinds: Any, sigma: float, table: Any, blur: float, out: Any
-) -> None:
-    """The negative log-likelihood of all beams for each of many shapes: ``families`` (M,), ``samples`` (M, 5)."""
-    r, s = np.empty(BLOCK), np.empty(BLOCK)
+def negative_log_likelihoods(outlines: Any, numbers: Any, samples: Any, data: Any, blur: float, out: Any) -> None:
+    """Compute the negative log-likelihood of all rays for each of many shapes.
+
+    Args:
+        outlines: the kinds' outlines.
+        numbers: (M,) the kinds' numbers.
+        samples: (M, 5) parameters.
+        data: the :class:`RayData`.
+        blur: (m).
+        out: (M,) gets the costs (nats).
+    """
+    rays, outcomes, sigma, table = data
+    ranges, clearances, scratch = np.empty(BLOCK), np.empty(BLOCK), np.empty((SCRATCH_ROWS, BLOCK))
     hits, edges = np.empty(BLOCK + 1, np.int64), np.empty(BLOCK + 1, np.int64)
     out[:] = 0.0
-    for first in range(0, len(kinds), BLOCK):
-        count = min(BLOCK, len(kinds) - first)
+    for first in range(0, len(outcomes), BLOCK):
+        count = min(BLOCK, len(outcomes) - first)
         for k in range(len(samples)):
-            meet(families[k], samples[k], beams, first, count, r, s)
-            hit, edge, total = hits_and_edges(beams, first, count, r, s, blur, hits, edges)
+            intersect(outlines, numbers[k], samples[k], rays, first, count, ranges, clearances, scratch)
+            hit, edge, total = partition(rays, first, ranges, clearances, blur, hits, edges, count)
             for n in range(hit):
                 i = hits[n]
-                x = (max(r[i], 0.0) - beams[RANGE, first + i]) / sigma
-                total += looked_up(table, kinds[first + i], x)
+                x = (max(ranges[i], 0.0) - rays[RANGE, first + i]) / sigma
+                total += lookup(table, outcomes[first + i], x)
             for n in range(edge):
                 i = edges[n]
-                x = (max(r[i], 0.0) - beams[RANGE, first + i]) / sigma
-                share = share_hit(s[i], blur)
-                hit_chance = math.exp(looked_up(table, kinds[first + i], x))
-                total += math.log(share * hit_chance + (1.0 - share) * math.exp(beams[MISS, first + i]))
+                x = (max(ranges[i], 0.0) - rays[RANGE, first + i]) / sigma
+                share = hit_fraction(clearances[i], blur)
+                hit_chance = math.exp(lookup(table, outcomes[first + i], x))
+                total += math.log(share * hit_chance + (1.0 - share) * math.exp(rays[BACKGROUND, first + i]))
             out[k] -= total
 
 
-def _slopes(
-    family: int,
-    p: Any,
-    beams: Any,
-    kinds: Any,
-    sigma: float,
-    table: Any,
-    blur: float,
-    gradient: Any,
-    information: Any,
+def _gradient(  # noqa: C901 - one pass over the rays
+    outlines: Any, k: int, p: Any, data: Any, blur: float, gradient: Any, information: Any
 ) -> float:
-    """The negative log-likelihood of all beams; its gradient (5,), information (5, 5).
+    """Compute the negative log-likelihood of all rays, its gradient, and the information.
 
-    Information is Gauss and Newton's for rays that hit, and the squared score for what silhouettes say.
+    The information is Gauss and Newton's for rays that hit, and the squared score for rays at silhouettes.
+
+    Args:
+        outlines: the kinds' outlines.
+        k: the kind's number.
+        p: (5,) parameters.
+        data: the :class:`RayData`.
+        blur: (m).
+        gradient: (5,) gets the gradient by p.
+        information: (5, 5) gets the information on p.
+
+    Returns:
+        The cost (nats).
     """
-    r, s = np.empty(BLOCK), np.empty(BLOCK)
+    form = outlines.form[k]
+    rays, outcomes, sigma, table = data
+    ranges, clearances, scratch = np.empty(BLOCK), np.empty(BLOCK), np.empty((SCRATCH_ROWS, BLOCK))
     hits, edges = np.empty(BLOCK + 1, np.int64), np.empty(BLOCK + 1, np.int64)
-    rays, dr = np.empty((RANGE, BLOCK)), np.empty((PARAMETERS, BLOCK))
-    steep, curve = np.empty(BLOCK), np.empty(BLOCK)
+    hitting, dr = np.empty((RANGE, BLOCK)), np.empty((PARAMETERS, BLOCK))
+    slope, curvature = np.empty(BLOCK), np.empty(BLOCK)
     moved, slid, score = np.zeros(PARAMETERS), np.zeros(PARAMETERS), np.zeros(PARAMETERS)
     gradient[:] = 0.0
     information[:] = 0.0
-    cos, sin = math.cos(p[THETA]), math.sin(p[THETA])
+    heading = math.cos(p[THETA]), math.sin(p[THETA])
     total = 0.0
-    for first in range(0, len(kinds), BLOCK):
-        count = min(BLOCK, len(kinds) - first)
-        meet(family, p, beams, first, count, r, s)
-        hit, edge, missed = hits_and_edges(beams, first, count, r, s, blur, hits, edges)
+    for first in range(0, len(outcomes), BLOCK):
+        count = min(BLOCK, len(outcomes) - first)
+        intersect(outlines, k, p, rays, first, count, ranges, clearances, scratch)
+        hit, edge, missed = partition(rays, first, ranges, clearances, blur, hits, edges, count)
         total += missed
         for n in range(hit):
             i = first + hits[n]
-            x = (max(r[hits[n]], 0.0) - beams[RANGE, i]) / sigma
-            total += looked_up(table, kinds[i], x)
-            steep[n] = looked_up(table, 3 + kinds[i], x) / sigma
-            curve[n] = curve_of(kinds[i], steep[n], x, sigma)
+            x = (max(ranges[hits[n]], 0.0) - rays[RANGE, i]) / sigma
+            total += lookup(table, outcomes[i], x)
+            slope[n] = lookup(table, 3 + outcomes[i], x) / sigma
+            curvature[n] = range_information(outcomes[i], slope[n], x, sigma)
             for row in range(RANGE):
-                rays[row, n] = beams[row, i]
-        turn_with(family, p, rays, hit, dr)
+                hitting[row, n] = rays[row, i]
+        if form == POLYGON:
+            polygon_range_gradients(outlines, k, p, hitting, hit, dr, scratch)
+        else:
+            range_gradients(form, p, hitting, hit, dr)
         for a in range(PARAMETERS):
-            gradient[a] -= summed(steep, dr[a], dr[a], hit, False)
+            gradient[a] -= weighted_sum(slope, dr[a], dr[a], hit, False)
             for b in range(a + 1):
-                information[a, b] += summed(curve, dr[a], dr[b], hit, True)
+                information[a, b] += weighted_sum(curvature, dr[a], dr[b], hit, True)
         for n in range(edge):
             i = first + edges[n]
-            at, aside = told_by(family, p, cos, sin, beams, i, blur, moved, slid)
-            x = (max(at, 0.0) - beams[RANGE, i]) / sigma
-            share = share_hit(aside, blur)
-            hit_chance, miss_chance = math.exp(looked_up(table, kinds[i], x)), math.exp(beams[MISS, i])
+            if form == POLYGON:
+                at, aside = polygon_with_gradient((outlines, k), p, heading, rays, i, blur, (moved, slid))
+            else:
+                at, aside = form_with_gradient(form, p, heading, rays, i, blur, (moved, slid))
+            x = (max(at, 0.0) - rays[RANGE, i]) / sigma
+            share = hit_fraction(aside, blur)
+            hit_chance, miss_chance = math.exp(lookup(table, outcomes[i], x)), math.exp(rays[BACKGROUND, i])
             likelihood = share * hit_chance + (1.0 - share) * miss_chance
             total += math.log(likelihood)
-            responsible = share * hit_chance / likelihood
-            downhill = looked_up(table, 3 + kinds[i], x) / sigma
-            told = responsible * curve_of(kinds[i], downhill, x, sigma)
+            responsibility = share * hit_chance / likelihood
+            downhill = lookup(table, 3 + outcomes[i], x) / sigma
+            known = responsibility * range_information(outcomes[i], downhill, x, sigma)
             u = 0.5 * (aside / blur + 1.0)
-            slope = (hit_chance - miss_chance) / likelihood * 3.0 * u * (1.0 - u) / blur
+            step = (hit_chance - miss_chance) / likelihood * 3.0 * u * (1.0 - u) / blur
             for a in range(PARAMETERS):
-                score[a] = slope * slid[a]
-                gradient[a] -= responsible * downhill * moved[a] + score[a]
+                score[a] = step * slid[a]
+                gradient[a] -= responsibility * downhill * moved[a] + score[a]
                 for b in range(a + 1):
-                    information[a, b] += told * moved[a] * moved[b] + score[a] * score[b]
+                    information[a, b] += known * moved[a] * moved[b] + score[a] * score[b]
     for a in range(PARAMETERS):
         for b in range(a):
             information[b, a] = information[a, b]
     return -total
 
 
-slopes_of, slopes = part(_slopes), kernel(_slopes)
+gradient_part, gradient = part(_gradient), kernel(_gradient)
 """The same, for kernels to be made of, and as a kernel."""
 
 
 @part
-def summed(weight: Any, one: Any, other: Any, count: int, both: bool) -> float:
-    """The sum of ``weight`` times ``one``, and times ``other`` where ``both`` count."""
+def weighted_sum(weight: Any, first: Any, second: Any, count: int, both: bool) -> float:
+    """Return the sum of ``weight`` times ``first``, and times ``second`` where ``both`` count."""
     total = 0.0
     for n in range(count):
-        total += weight[n] * one[n] * (other[n] if both else 1.0)
+        total += weight[n] * first[n] * (second[n] if both else 1.0)
     return total
 
 
 @part
-def curve_of(kind: int, steep: float, x: float, sigma: float) -> float:
-    """How much a ray that hits tells of its distance (1 / m²); ``steep`` is its log-likelihood's slope there.
+def range_information(outcome: int, slope: float, x: float, sigma: float) -> float:
+    """Return the information (1 / m²) of a ray that hits on its range; ``slope`` is its log-likelihood's derivative.
 
-    Of a range that was measured the slope is -x times the share that is no outlier: what is left of it over x.
+    Of a measured range the slope is -x times the share that is no outlier: what is left of it over x.
     """
-    if kind != MEASURED:
-        return steep * steep
-    return -steep / (x * sigma) if abs(x) > 1e-6 else 1.0 / (sigma * sigma)
+    if outcome != MEASURED:
+        return slope * slope
+    return -slope / (x * sigma) if abs(x) > 1e-6 else 1.0 / (sigma * sigma)
 
 
 @part
-def solve(matrix: Any, vector: Any, damping: float, out: Any, lower: Any, size: int) -> bool:
-    """Solves (matrix + damping diag(matrix)) out = vector by Cholesky's factors; False where there are none."""
+def solve_damped(matrix: Any, vector: Any, damping: float, out: Any, lower: Any, size: int) -> bool:
+    """Solve (matrix + damping diag(matrix)) out = vector by Cholesky; False where not positive definite."""
     for a in range(size):
         for b in range(a + 1):
             total = matrix[a, b]
@@ -613,7 +903,7 @@ def solve(matrix: Any, vector: Any, damping: float, out: Any, lower: Any, size: 
 
 @part
 def project(tie: Any, size: int, gradient: Any, full: Any, downhill: Any, information: Any) -> None:
-    """A kind's own downhill direction (K,) and information (K, K), of those of the five parameters."""
+    """Set a kind's own downhill direction (K,) and information (K, K) from those of the five parameters."""
     for k in range(size):
         downhill[k] = 0.0
         for a in range(PARAMETERS):
@@ -626,84 +916,61 @@ def project(tie: Any, size: int, gradient: Any, full: Any, downhill: Any, inform
 
 
 @part
-def step_to(p: Any, tie: Any, size: int, change: Any, trial: Any) -> None:
-    """Where a change (K,) of a kind's own parameters leads; a size is no more than halved or doubled."""
+def step(p: Any, tie: Any, size: int, change: Any, schedule: Any, trial: Any) -> None:
+    """Set the parameters after a change (K,) of a kind's own; a size is no more than halved or doubled."""
     for a in range(PARAMETERS):
         trial[a] = p[a]
         for k in range(size):
             trial[a] += tie[a, k] * change[k]
     for a in (WIDTH, HEIGHT):
-        trial[a] = min(max(trial[a], 0.5 * p[a], SMALLEST), 2 * p[a], LARGEST)
+        trial[a] = min(max(trial[a], 0.5 * p[a], schedule.min_size), 2 * p[a], schedule.max_size)
 
 
 @kernel
 def descend(
-    families: Any,
+    outlines: Any,
+    numbers: Any,
     shapes: Any,
     ties: Any,
     sizes: Any,
-    beams: Any,
-    kinds: Any,
-    sigma: float,
-    table: Any,
-    blurs: Any,
-    iterations: int,
-    tolerance: float,
-    known_to: float,
+    data: Any,
+    schedule: Any,
     cost: Any,
     information: Any,
 ) -> None:
-    """Moves each of some ``shapes`` (M, 5) downhill by Levenberg and Marquardt's steps, one blur after the other.
+    """Minimise the negative log-likelihood from each of some shapes by Levenberg and Marquardt's method.
 
-    ``ties`` (M, 5, 5) map a kind's own parameters, of which there are ``sizes`` (M,), to the five. Leaves the
-    ``cost`` (M,) at the last blur, and the ``information`` (M, 5, 5) on a kind's own parameters, with a blur of
-    ``known_to`` (m) where the last is narrower.
+    Args:
+        outlines: the kinds' outlines.
+        numbers: (M,) the kinds' numbers.
+        shapes: (M, 5) parameters, changed in place.
+        ties: (M, 5, 5) the matrices from the kinds' own parameters to the five.
+        sizes: (M,) how many own parameters there are.
+        data: the :class:`RayData`.
+        schedule: the :class:`Schedule`.
+        cost: (M,) gets the costs (nats) at the last blur.
+        information: (M, 5, 5) gets the information on own parameters.
     """
     for k in range(len(shapes)):
-        cost[k] = descended(
-            families[k],
-            shapes[k],
-            ties[k],
-            sizes[k],
-            beams,
-            kinds,
-            sigma,
-            table,
-            blurs,
-            iterations,
-            tolerance,
-            known_to,
-            information[k],
-        )
+        cost[k] = descend_one(outlines, numbers[k], shapes[k], ties[k], sizes[k], data, schedule, information[k])
 
 
 @part
-def descended(
-    family: int,
-    p: Any,
-    tie: Any,
-    size: int,
-    beams: Any,
-    kinds: Any,
-    sigma: float,
-    table: Any,
-    blurs: Any,
-    iterations: int,
-    tolerance: float,
-    known_to: float,
-    information: Any,
+def descend_one(
+    outlines: Any, number: int, p: Any, tie: Any, size: int, data: Any, schedule: Any, information: Any
 ) -> float:
-    """As :func:`descend`, of one shape."""
+    """As :func:`descend`, of one shape; returns its cost (nats)."""
     gradient, full = np.zeros(PARAMETERS), np.zeros((PARAMETERS, PARAMETERS))
     other_gradient, other_full = np.zeros(PARAMETERS), np.zeros((PARAMETERS, PARAMETERS))
     downhill, change, lower = np.zeros(size), np.zeros(size), np.zeros((size, size))
     trial = np.zeros(PARAMETERS)
+    blurs = schedule.blurs
     cost = math.inf
     for blur in blurs:
-        cost, damping = math.inf, HOPEFUL
+        cost, damping = math.inf, schedule.first_damping
         trial[:] = p
-        for count in range(iterations + 1):
-            found = slopes_of(family, trial, beams, kinds, sigma, table, blur, other_gradient, other_full)
+        for count in range(schedule.iterations + 1):
+            found = gradient_part(outlines, number, trial, data, blur, other_gradient, other_full)
             if found < cost:
                 gained = cost - found
                 cost = found
@@ -711,81 +978,19 @@ def descended(
                 gradient[:] = other_gradient
                 full[:] = other_full
                 damping = max(0.2 * damping, 1e-6) if count else damping
-                if gained < tolerance:
+                if gained < schedule.tolerance:
                     break
             else:
                 damping *= 8
             project(tie, size, gradient, full, downhill, information)
-            while damping < HOPELESS and not solve(information, downhill, damping, change, lower, size):
+            while damping < schedule.max_damping and not solve_damped(
+                information, downhill, damping, change, lower, size
+            ):
                 damping = max(10 * damping, 1e-3)
-            if damping > HOPELESS:
+            if damping > schedule.max_damping:
                 break
-            step_to(p, tie, size, change, trial)
-    if blurs[-1] < known_to:
-        slopes_of(family, p, beams, kinds, sigma, table, known_to, gradient, full)
+            step(p, tie, size, change, schedule, trial)
+    if blurs[-1] < schedule.information_blur:
+        gradient_part(outlines, number, p, data, schedule.information_blur, gradient, full)
     project(tie, size, gradient, full, downhill, information)
     return cost
-
-
-@kernel
-def clearances(occupied: Any, out: Any) -> None:
-    """How many steps (to any of 8 neighbours) it is from each cell of a map to one that is occupied, or beyond it.
-
-    0 where it is occupied itself, no more than 255.
-    """
-    rows, cols = occupied.shape
-    for r in range(rows):
-        for c in range(cols):
-            near = 0
-            if r > 0 and 0 < c < cols - 1:
-                near = min(out[r - 1, c - 1], out[r - 1, c], out[r - 1, c + 1], out[r, c - 1])
-            out[r, c] = 0 if occupied[r, c] else min(near + 1, 255)
-    for r in range(rows - 1, -1, -1):
-        for c in range(cols - 1, -1, -1):
-            near = 0
-            if r < rows - 1 and 0 < c < cols - 1:
-                near = min(out[r + 1, c - 1], out[r + 1, c], out[r + 1, c + 1], out[r, c + 1])
-            out[r, c] = min(out[r, c], near + 1)
-
-
-@kernel
-def walk(
-    clear: Any, row: int, col: int, inverse_resolution: float, beams: Any, most: Any, stops: Any, ends: Any
-) -> None:
-    """Where (m) beams end in a map: in the first occupied cell, or (``ends`` False) where they leave it.
-
-    ``clear`` (rows, cols), of :func:`clearances`, begins at cell (row, col) of the plane: over what is free several
-    cells are taken at once. ``most`` (N,) are the sensor's largest ranges.
-    """
-    rows, cols = clear.shape
-    for i in range(len(stops)):
-        x, y = beams[ORIGIN_X, i] * inverse_resolution - col, beams[ORIGIN_Y, i] * inverse_resolution - row
-        dx, dy = beams[DIRECTION_X, i], beams[DIRECTION_Y, i]
-        far = most[i] * inverse_resolution
-        c, r = math.floor(x), math.floor(y)
-        step_c, step_r = (1 if dx > 0 else -1), (1 if dy > 0 else -1)
-        first_c, first_r = (1 if dx > 0 else 0), (1 if dy > 0 else 0)
-        per_c = 1.0 / dx if dx != 0.0 else FAR
-        per_r = 1.0 / dy if dy != 0.0 else FAR
-        per_cell = min(abs(per_c), abs(per_r))
-        at, ends[i] = 0.0, False
-        while at < far:
-            next_c = (c + first_c - x) * per_c if dx != 0.0 else FAR
-            next_r = (r + first_r - y) * per_r if dy != 0.0 else FAR
-            if 0 <= c < cols and 0 <= r < rows:
-                free = clear[r, c]
-                if free == 0:
-                    at, ends[i] = 0.5 * (at + min(next_c, next_r)), True
-                    break
-                if free > 2:
-                    at += (free - 1) * per_cell
-                    c, r = math.floor(x + at * dx), math.floor(y + at * dy)
-                    continue
-            elif (c < 0 and dx <= 0) or (c >= cols and dx >= 0) or (r < 0 and dy <= 0) or (r >= rows and dy >= 0):
-                break
-            at = min(next_c, next_r)
-            if next_c <= next_r:
-                c += step_c
-            else:
-                r += step_r
-        stops[i] = min(at, far) / inverse_resolution

@@ -1,4 +1,4 @@
-"""Straight lines through points (RANSAC, then the points' main axis)."""
+"""Straight lines through points: RANSAC (Fischler and Bolles 1981), then the principal axis of the inliers."""
 
 from __future__ import annotations
 
@@ -8,76 +8,112 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from detect.refinement.options import DEFAULTS, LineOptions
 from prim.arrays import FloatArray
 from prim.compiled import kernel
 
 Line = tuple[float, float, float]
-"""nx, ny, d: points with nx x + ny y = d."""
-
-TRIALS = 60
-MOST_POINTS = 4000
-"""Lines are looked for among no more points than this, chosen at random."""
-
-REFITS, SPREADS = 3, 2.0
-"""A line is moved to its middle so often, by points that are off by no more than so many times the median."""
+"""nx, ny, d: the points with nx x + ny y = d, the normal (nx, ny) of unit length."""
 
 
 def find_lines(
-    points: FloatArray, resolution: float, least_length: float, most: int, width: float = 1.0
+    points: FloatArray,
+    resolution: float,
+    min_length: float,
+    max_lines: int,
+    width: float = 1.0,
+    options: LineOptions = DEFAULTS.lines,
 ) -> list[Line]:
-    """Lines through cells' centres (N, 2), within ``width`` cells, over ``least_length`` (m) of them; the longest are
-    first.
+    """Find straight lines through cells' centres, those with most cells first.
+
+    Args:
+        points: (N, 2) centres (m).
+        resolution: the cells' side (m).
+        min_length: a line has cells for this length (m) at least.
+        max_lines: how many to find at most.
+        width: cells lie within this distance (cells) of a line.
+        options: the numbers.
+
+    Returns:
+        The lines.
     """
     rng = np.random.default_rng(0)
     share = 1.0
-    if len(points) > MOST_POINTS:
-        share = MOST_POINTS / len(points)
-        points = points[np.sort(rng.choice(len(points), MOST_POINTS, replace=False))]
-    least = max(least_length / resolution * share, 8.0)
+    if len(points) > options.max_points:
+        share = options.max_points / len(points)
+        points = points[np.sort(rng.choice(len(points), options.max_points, replace=False))]
+    fewest = max(min_length / resolution * share, options.min_inliers)
     found: list[Line] = []
-    while len(found) < most and len(points) > least:
-        best = _most_on_a_line(points, width * resolution, rng)
-        if np.count_nonzero(best) < least:
+    while len(found) < max_lines and len(points) > fewest:
+        inliers = _largest_consensus(points, width * resolution, rng, options)
+        if np.count_nonzero(inliers) < fewest:
             break
-        found.append(line := _main_axis(points[best]))
-        points = points[off_line(points, line) > (2 + width) * resolution]
+        found.append(line := _principal_axis(points[inliers]))
+        points = points[distance_to_line(points, line) > (2 + width) * resolution]
     return found
 
 
-def middle_line(points: FloatArray, resolution: float) -> Line:
-    """The line along points (N, 2), those left out that lie further from it than most do: sharp walls stay sharp."""
-    line = _main_axis(points)
-    for _ in range(REFITS):
-        off = off_line(points, line)
-        line = _main_axis(points[off <= max(SPREADS * float(np.median(off)), resolution)])
+def trimmed_line(points: FloatArray, resolution: float, options: LineOptions = DEFAULTS.lines) -> Line:
+    """Fit a line to points, without those that lie further from it than most do.
+
+    Args:
+        points: (N, 2) in metres.
+        resolution: points within this distance (m) always count.
+        options: the numbers.
+
+    Returns:
+        The line.
+    """
+    line = _principal_axis(points)
+    for _ in range(options.refits):
+        off = distance_to_line(points, line)
+        line = _principal_axis(points[off <= max(options.medians * float(np.median(off)), resolution)])
     return line
 
 
-def off_line(points: FloatArray, line: Line) -> FloatArray:
-    """How far (m) points (N, 2) are from a line."""
+def distance_to_line(points: FloatArray, line: Line) -> FloatArray:
+    """Return the distances (m) of points from a line.
+
+    Args:
+        points: (N, 2).
+        line: the line.
+
+    Returns:
+        (N,) 0 or more.
+    """
     return np.asarray(np.abs(points @ np.array(line[:2]) - line[2]))
 
 
-def _main_axis(points: FloatArray) -> Line:
+def _principal_axis(points: FloatArray) -> Line:
+    """Return the total-least-squares line."""
     middle = points.mean(axis=0)
     normal = np.linalg.eigh(np.cov((points - middle).T))[1][:, 0]
     return float(normal[0]), float(normal[1]), float(normal @ middle)
 
 
-def _most_on_a_line(points: FloatArray, within: float, rng: np.random.Generator) -> NDArray[np.bool_]:
-    """Which points lie ``within`` (m) of the line through two of them that has most."""
-    pairs = rng.integers(len(points), size=(TRIALS, 2))
-    best = pairs[best_pair(np.ascontiguousarray(points.T), pairs, within)]
+def _largest_consensus(
+    points: FloatArray, within: float, rng: np.random.Generator, options: LineOptions
+) -> NDArray[np.bool_]:
+    """Return which points lie within a distance (m) of the line through two of them that most do."""
+    pairs = rng.integers(len(points), size=(options.trials, 2))
+    best = pairs[best_pair(np.ascontiguousarray(points.T), pairs, within, options.baseline * within)]
     first, second = points[best]
     along = second - first
     return np.asarray(np.abs((points - first) @ (-along[1], along[0])) < within * math.hypot(*along))
 
 
 @kernel
-def best_pair(points: Any, pairs: Any, within: float) -> int:
-    """Which pair (T, 2) of points (2, N) has the line with most ``within`` (m): the first where there are several.
+def best_pair(points: Any, pairs: Any, within: float, baseline: float) -> int:
+    """Find the pair of points whose line has most points near it.
 
-    Pairs that are no further apart than eight times that have no line.
+    Args:
+        points: (2, N).
+        pairs: (T, 2) indices.
+        within: distance (m) from the line.
+        baseline: pairs that are nearer to each other (m) have no line.
+
+    Returns:
+        The index of the pair: the first of equals.
     """
     best, most = 0, 0
     for k in range(len(pairs)):
@@ -85,7 +121,7 @@ def best_pair(points: Any, pairs: Any, within: float) -> int:
         x, y = points[0, first], points[1, first]
         nx, ny = y - points[1, second], points[0, second] - x
         length = math.sqrt(nx * nx + ny * ny)
-        if length < 8 * within:
+        if length < baseline:
             continue
         nx, ny = nx / length, ny / length
         d, count = nx * x + ny * y, 0

@@ -1,101 +1,58 @@
-"""Refinement: from a guess to the primitive that makes the log's own rays most likely, with its uncertainty.
+"""Refinement: from guesses to the primitives that make the log's own rays most likely, with their uncertainty.
 
-For every candidate (what the networks found, and things in the map that they missed):
+For every candidate (detections of the networks, and components of the map that they missed):
 
-1. the rays that pass it are gathered, and what stands behind it is read from the map and from the other candidates
-   (detect.refinement.rays);
-2. every kind is fitted, from several starts (turned, mirrored), coarsely to few rays and then to all of them
-   (detect.refinement.fit);
-3. kinds are weighed by their evidence, the likelihood averaged over all parameters: a square that explains the rays
-   as well as a rectangle does is the likelier one, since it has one size less to choose; the same samples give the
-   mean and the covariance of the parameters (detect.refinement.evidence).
+1. the rays that pass it are collected (rays), and what stands behind it is read from the map (sensor_model, walls);
+2. every kind is fitted by maximum likelihood from several starts (fit);
+3. kinds are compared by their evidence, and the likeliest one's posterior gives the mean and the covariance of the
+   parameters (evidence).
 
-Candidates see each other's shadows: all are fitted once, those that are found twice go, and what is left is fitted
-again beside the others. The noise is found from the rays on the way. What the rays contradict is no detection.
+Candidates occlude each other: all are fitted once, duplicates are removed, and the rest is fitted again beside the
+others. The sensor's noise, footprint and dispersion are estimated from the rays on the way (sensor_estimation). What
+the rays contradict is rejected, with the reason.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from concurrent.futures import Executor, ThreadPoolExecutor
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
 
 from detect.detection import Detection, Detections, Rejection
-from detect.refinement.candidates import Candidate, fit_all, look_behind, share_of
-from detect.refinement.evidence import weighed
-from detect.refinement.kernels import MISS, STOP
+from detect.refinement.candidates import Candidate, find_backgrounds, fit_candidates, shared_area
+from detect.refinement.evidence import compare_kinds
+from detect.refinement.geometry import parameters_of, ranges_to
+from detect.refinement.kernels import BACKGROUND, OCCLUSION
 from detect.refinement.map_cells import MapCells
-from detect.refinement.proposals import MOST_PROPOSALS, proposals
-from detect.refinement.rays import (
-    Backdrop,
-    Beams,
-    Obstacles,
-    Sensor,
-    backdrop,
-    explained,
-    gather,
-    parameters,
-)
-from detect.refinement.sensor_model import CLEARLY, distance_to, first_noise, measured, measured_noise
+from detect.refinement.options import DEFAULTS, AcceptanceOptions, RefinementOptions
+from detect.refinement.proposals import propose
+from detect.refinement.rays import RayBundle, collect_rays
+from detect.refinement.sensor_estimation import estimate_noise, estimate_sensor, initial_noise
+from detect.refinement.sensor_model import Background, BeamModel, ClearanceMap, surface_likelihood
 from mapping.grid import OccupancyGrid
 from prim.arrays import FloatArray
 from prim.scan import Scan
 from prim.se2 import Pose2D
 from prim.shapes import Kind, Primitive
 
-PREFERRED = 1.5
-"""What the networks found stays where it explains the rays at least 1 / this as well as what they did not find."""
-
-REACH, REACH_FITTED = 0.07, 0.03
-"""Rays that come within this (m) of a candidate are looked at: at first, and once it is fitted."""
-
-ROUNDS, SETTLED = 2, 0.002
-"""So often all candidates are fitted beside each other, once they are told apart; no more where none moves by more
-than this (m, rad).
-"""
-
-LEAST_GAIN = 25.0
-"""A primitive makes the rays more likely than an empty place does by at least so much (nats)."""
-
-MOST_MISFIT = 0.25
-"""Of the rays that meet a primitive, the map explains each better by no more than this (nats) on average."""
-
-MOST_SPREAD = 0.25
-"""And its sizes are known to within this share of them (one standard deviation)."""
-
-LEAST_SEEN = 0.35
-"""What the networks did not find, or hardly, must be seen in this share of the directions around it."""
-
-LEAST_SURE = 0.33
-"""And its kind must be at least as sure as this."""
-
-SURE = 0.95
-"""What was as sure as this of its kind at an earlier look is not asked for it again at the next."""
-
-LEAST_SHARED = 0.25
-"""And it shares this much of the smaller area with what it was first taken for."""
-
-SECTORS = 24
-"""Directions around a primitive's centroid, in which its outline is seen or not."""
-
-SAME = 0.25
-"""Two candidates that share more than this (of the smaller one's area) are one."""
-
-CLEARED_FIRST, CLEARED = 0.03, 0.02
-"""So far (m) around a candidate the map's cells are its own, not what stands behind: at first, and once fitted."""
-
 
 @dataclass(frozen=True)
-class Refined:
-    """A primitive that rays were fitted to.
+class RefinedPrimitive:
+    """A primitive that was fitted to rays.
 
-    ``std`` (m, rad) by name: x, y, theta and the sizes; ``covariance`` in the same order; ``chances`` of the kinds;
-    ``gain``: by how much (nats) the rays are likelier than without it; ``misfit``: by how much (nats a ray) the map
-    explains those that meet it better; ``rays``: how many do; ``seen``: the share of its outline that they meet.
+    Attributes:
+        primitive: the likeliest kind at its posterior mean.
+        std: standard deviations (m, rad) by name: x, y, theta and the sizes.
+        covariance: (K, K) in the same order.
+        chances: posterior probabilities of the kinds.
+        gain: log-likelihood gain of the rays over an empty place (nats).
+        misfit: by how much the map alone explains the rays that meet it better (nats a ray).
+        rays: how many rays meet it.
+        seen: share of the directions around it in which they do.
     """
 
     primitive: Primitive
@@ -109,26 +66,35 @@ class Refined:
 
     @property
     def score(self) -> float:
-        """The chance that the kind is right."""
+        """The posterior probability of its kind."""
         return self.chances[self.primitive.kind]
 
 
 @dataclass(frozen=True)
-class Pace:
-    """How thoroughly detections are refined; on the way, where a look follows on another, it may be done faster.
+class WarmStart:
+    """What an earlier pass over a growing map came to: its detections and the noise (m)."""
 
-    ``before``: what an earlier look at a growing map came to, with the noise (m) that it found. What was sure of its
-    kind then is fitted on from there, which takes a fraction of the time, and what was missed is not looked for.
-    Without it, that is done in the ``most_proposals`` largest things of the map. ``rounds``: so often all are fitted
-    beside each other, once they are told apart.
+    detections: Detections
+    noise_std: float | None
+
+
+@dataclass(frozen=True)
+class Effort:
+    """How thoroughly detections are refined.
+
+    Attributes:
+        warm_start: an earlier pass. What was sure of its kind then is fitted on from there, which takes a fraction of
+            the time, and the map is not searched for what the networks missed.
+        max_proposals: components of the map that are proposed; None: as in the options.
+        rounds: joint fits once duplicates are gone; None: as in the options.
     """
 
-    before: tuple[Detections, float | None] | None = None
-    most_proposals: int = MOST_PROPOSALS
-    rounds: int = ROUNDS
+    warm_start: WarmStart | None = None
+    max_proposals: int | None = None
+    rounds: int | None = None
 
 
-THOROUGH = Pace()
+THOROUGH = Effort()
 
 
 def refine_detections(
@@ -137,205 +103,345 @@ def refine_detections(
     grid: OccupancyGrid,
     noise_std: float | None = None,
     threads: int = 2,
-    pace: Pace = THOROUGH,
+    effort: Effort = THOROUGH,
+    options: RefinementOptions = DEFAULTS,
 ) -> tuple[Detections, float | None]:
-    """Detections in ``grid`` refined by the scans that it was made of, and what was missed in it beside them.
+    """Refine a map's detections, and find what the networks missed.
 
-    ``noise_std`` (m) is the range noise, where it is known. Returns what the rays support, likeliest first, what they
-    do not with the reasons, and the noise: None where no ray passes any.
+    Args:
+        detections: of the networks.
+        scans: the scans that the map was made of, with the poses of their laser.
+        grid: the map.
+        noise_std: range noise (m) where it is known.
+        threads: how many are used; results do not depend on it.
+        effort: how thoroughly.
+        options: the numbers.
+
+    Returns:
+        What the rays support, likeliest kinds first, and what they do not, with the reasons; and the noise (m), None
+        where no ray passes any candidate.
     """
-    cells = MapCells.of(grid)
-    before, guess_std = pace.before or (None, None)
-    unsure = _gone(before, detections) if before else [one for one, _ in detections.doubtful]
-    unsure = [one for one in unsure if not cells.hide(one.primitive)]
-    guesses = [one.primitive for one in (*detections.found, *unsure)]
-    added = [_proposed(one) for one in proposals(cells, guesses, pace.most_proposals)] if before is None else []
-    wanted = (*detections.found, *unsure, *added)
-    known = _known_before(wanted, before)
-    starts = [known.get(number, one).primitive for number, one in enumerate(wanted)]
-    refined, found_std = refine(
-        starts, scans, cells, noise_std, threads, known, len(detections.found), pace.rounds, guess_std
+    cells = MapCells.of(grid, options.map)
+    wanted, undecided = _candidates_of(detections, cells, effort, options)
+    found = len(detections.found)
+    warm_start = effort.warm_start
+    known = _known_before(wanted, warm_start.detections, options.acceptance) if warm_start else {}
+    starts = [known.get(number, detection).primitive for number, detection in enumerate(wanted)]
+    refinement = Refinement(
+        cells,
+        noise_std,
+        threads,
+        guessed_noise=warm_start.noise_std if warm_start else None,
+        rounds=effort.rounds,
+        options=options,
     )
+    refined = refinement.run(starts, scans, known, preferred=found)
     kept: list[Detection] = []
     rejected = []
-    for number, (guess, made) in enumerate(zip(wanted, refined, strict=True)):
-        reason = contradiction(made) if number < len(detections.found) else doubt(made, guess.primitive, cells)
-        if made is None or reason:
-            rejected.append(_rejected(guess, made, reason))
+    for number, (guess, result) in enumerate(zip(wanted, refined, strict=True)):
+        if number < found:
+            reason = rejection_reason(result, options.acceptance)
         else:
-            kept.append(_detection(made, guess.crop))
-    asked = {id(one) for one in unsure}
-    judged = {id(rejection) for one, rejection in detections.doubtful if id(one) in asked}
-    rejected += [one for one in detections.rejected if id(one) not in judged]
-    kept.sort(key=lambda one: -one.score)
-    rejected.sort(key=lambda one: -one.score)
-    return Detections(tuple(kept), tuple(rejected)), found_std if kept else None
+            reason = proposal_rejection_reason(result, guess.primitive, cells, options.acceptance)
+        if result is None or reason:
+            rejected.append(_rejection(guess, result, reason))
+        else:
+            kept.append(_detection(result, guess.crop))
+    judged = {id(rejection) for doubtful, rejection in detections.doubtful if id(doubtful) in undecided}
+    rejected += [rejection for rejection in detections.rejected if id(rejection) not in judged]
+    kept.sort(key=lambda detection: -detection.score)
+    rejected.sort(key=lambda rejection: -rejection.score)
+    return Detections(tuple(kept), tuple(rejected)), refinement.noise_std if kept else None
 
 
-def _gone(before: Detections, detections: Detections) -> list[Detection]:
-    """What an earlier look had found, and the networks do not see now."""
-    now = [one.primitive for one in detections.found]
-    return [one for one in before.found if all(share_of(one.primitive, other) <= LEAST_SHARED for other in now)]
+def _candidates_of(
+    detections: Detections, cells: MapCells, effort: Effort, options: RefinementOptions
+) -> tuple[list[Detection], set[int]]:
+    """Return what is to be refined (detections first), and the ids of what the networks were not sure of."""
+    warm_start = effort.warm_start
+    if warm_start:
+        unsure = _missing(warm_start.detections, detections, options.acceptance)
+    else:
+        unsure = [doubtful for doubtful, _ in detections.doubtful]
+    unsure = [detection for detection in unsure if not cells.hides_centroid(detection.primitive)]
+    known = [detection.primitive for detection in (*detections.found, *unsure)]
+    proposed = [] if warm_start else propose(cells, known, effort.max_proposals, options.proposals)
+    wanted = [*detections.found, *unsure, *(_without_score(primitive) for primitive in proposed)]
+    return wanted, {id(detection) for detection in unsure}
 
 
-def _known_before(wanted: Sequence[Detection], before: Detections | None) -> dict[int, Detection]:
-    """Which of what is ``wanted`` was seen before, and was sure of its kind."""
-    sure = [one for one in (before.found if before else ()) if one.score >= SURE]
+def _missing(before: Detections, now: Detections, limits: AcceptanceOptions) -> list[Detection]:
+    """Return what an earlier pass had found, and the networks do not find now."""
+    found = [detection.primitive for detection in now.found]
+    return [
+        detection
+        for detection in before.found
+        if all(shared_area(detection.primitive, other) <= limits.min_shared for other in found)
+    ]
+
+
+def _known_before(wanted: Sequence[Detection], before: Detections, limits: AcceptanceOptions) -> dict[int, Detection]:
+    """Return, by the index of what is ``wanted``, the earlier detections that were sure of their kind."""
+    sure = [detection for detection in before.found if detection.score >= limits.sure]
     known = {}
-    for number, one in enumerate(wanted):
-        same = [other for other in sure if share_of(one.primitive, other.primitive) > LEAST_SHARED]
+    for number, detection in enumerate(wanted):
+        shared = [(shared_area(detection.primitive, other.primitive), other) for other in sure]
+        same = [pair for pair in shared if pair[0] > limits.min_shared]
         if same:
-            known[number] = max(same, key=lambda other: share_of(one.primitive, other.primitive))
+            known[number] = max(same, key=lambda pair: pair[0])[1]
     return known
 
 
-def _proposed(primitive: Primitive) -> Detection:
-    """Something in the map that the networks did not see: without score, box and crop."""
+def _without_score(primitive: Primitive) -> Detection:
+    """Return a component of the map as a detection: without score, box and crop."""
     return Detection(primitive, 0.0, (0.0, 0.0, 0.0, 0.0), np.zeros((0, 0), np.uint8))
 
 
-def contradiction(made: Refined | None) -> str:
-    """Why the rays speak against a primitive; nothing where they do not."""
-    if made is None:
+def rejection_reason(result: RefinedPrimitive | None, limits: AcceptanceOptions = DEFAULTS.acceptance) -> str:
+    """Say why the rays contradict a primitive.
+
+    Args:
+        result: what refinement made of it.
+        limits: the thresholds.
+
+    Returns:
+        The reason; empty where they do not.
+    """
+    if result is None:
         return "no ray passes it, a likelier one stands in its place, or it is too large or reaches into a wall"
-    if made.gain < LEAST_GAIN:
-        return f"the rays are likelier with it by {made.gain:.0f} nats only, less than {LEAST_GAIN:g}"
-    if made.misfit > MOST_MISFIT:
-        return f"its rays are likelier by {made.misfit:.2f} nats each in the map alone, more than {MOST_MISFIT:g}"
-    if any(made.std[name] > MOST_SPREAD * size for name, size in made.primitive.sizes.items()):
-        return f"its sizes are not known to within {MOST_SPREAD:.0%}"
+    if result.gain < limits.min_gain:
+        return f"the rays are likelier with it by {result.gain:.0f} nats only, less than {limits.min_gain:g}"
+    if result.misfit > limits.max_misfit:
+        better = f"{result.misfit:.2f} nats each in the map alone, more than {limits.max_misfit:g}"
+        return f"its rays are likelier by {better}"
+    sizes = result.primitive.sizes
+    if any(result.std[name] > limits.max_relative_std * size for name, size in sizes.items()):
+        return f"its sizes are not known to within {limits.max_relative_std:.0%}"
     return ""
 
 
-def doubt(made: Refined | None, guess: Primitive, cells: MapCells) -> str:
-    """Why something that the networks did not find, or were not sure of, is no detection; nothing where it is."""
-    before = "not found, or hardly, by the networks; "
-    reason = contradiction(made)
-    if made is None or reason:
-        return before + reason
-    if made.seen < LEAST_SEEN:
-        return f"{before}only {made.seen:.0%} of its outline is seen, less than {LEAST_SEEN:.0%}"
-    if cells.is_touched_by(made.primitive):
-        return f"{before}it reaches into a wall"
-    if share_of(made.primitive, guess) < LEAST_SHARED:
-        return f"{before}what explains its rays stands elsewhere"
-    if made.score < LEAST_SURE:
-        return f"{before}its kind is sure by {made.score:.2f} only, less than {LEAST_SURE:g}"
+def proposal_rejection_reason(
+    result: RefinedPrimitive | None,
+    guess: Primitive,
+    cells: MapCells,
+    limits: AcceptanceOptions = DEFAULTS.acceptance,
+) -> str:
+    """Say why something that the networks did not find, or were not sure of, is no detection.
+
+    Args:
+        result: what refinement made of it.
+        guess: what it was proposed as.
+        cells: the map.
+        limits: the thresholds.
+
+    Returns:
+        The reason; empty where it is one.
+    """
+    prefix = "not found, or hardly, by the networks; "
+    reason = rejection_reason(result, limits)
+    if result is None or reason:
+        return prefix + reason
+    if result.seen < limits.min_seen:
+        return f"{prefix}only {result.seen:.0%} of its outline is seen, less than {limits.min_seen:.0%}"
+    if cells.is_behind_extended_wall(result.primitive):
+        return f"{prefix}it reaches into a wall"
+    if shared_area(result.primitive, guess) < limits.min_shared:
+        return f"{prefix}what explains its rays stands elsewhere"
+    if result.score < limits.min_chance:
+        return f"{prefix}its kind is sure by {result.score:.2f} only, less than {limits.min_chance:g}"
     return ""
 
 
-def _rejected(guess: Detection, made: Refined | None, reason: str) -> Rejection:
-    fitted = None if made is None else _detection(made, guess.crop)
+def _rejection(guess: Detection, result: RefinedPrimitive | None, reason: str) -> Rejection:
+    fitted = None if result is None else _detection(result, guess.crop)
     return Rejection(guess.primitive.kind, guess.score, guess.primitive.x, guess.primitive.y, reason, fitted)
 
 
-def _detection(made: Refined, crop: NDArray[np.uint8]) -> Detection:
-    outline = made.primitive.outline()
+def _detection(result: RefinedPrimitive, crop: NDArray[np.uint8]) -> Detection:
+    outline = result.primitive.outline()
     (x0, y0), (x1, y1) = outline.min(axis=0).tolist(), outline.max(axis=0).tolist()
-    return Detection(made.primitive, made.score, (x0, y0, x1, y1), crop, made.std, made.chances)
+    return Detection(result.primitive, result.score, (x0, y0, x1, y1), crop, result.std, result.chances)
 
 
-def refine(
-    primitives: Sequence[Primitive],
-    scans: Iterable[tuple[Scan, Pose2D]],
-    cells: MapCells,
-    noise_std: float | None = None,
-    threads: int = 2,
-    known: Mapping[int, Detection] | None = None,
-    preferred: int = 0,
-    rounds: int = ROUNDS,
-    guess_std: float | None = None,
-) -> tuple[list[Refined | None], float | None]:
+@dataclass
+class Refinement:
     """Fits primitives to the rays of the scans that a map was made of.
 
-    All are fitted beside each other in so many ``rounds``. Those that are ``known``, by their index, are refined
-    already: their kind is not asked for again. Of two that stand in one place, the one stays that explains the rays
-    better, the first ``preferred`` ones before others. The noise (m) is ``noise_std`` where it is known, else it is
-    found from the rays, which begins with ``guess_std`` where that is given.
-    Returns, in the order given, each one refined, or None for one that no ray passes, that another one stands for as
-    well, or that is too large or reaches into a wall; and the noise (m), found from the rays where it is not given.
+    Attributes:
+        cells: the map.
+        noise_std: the range noise (m): known, or estimated by :meth:`run`.
+        threads: how many are used.
+        guessed_noise: a first guess (m) of the noise, where there is one.
+        rounds: joint fits once duplicates are gone; None: as in the options.
+        options: the numbers.
     """
-    if not primitives:
-        return [], noise_std
-    around, span, most = gather(scans, primitives, REACH)
-    known = known or {}
-    candidates = [
-        Candidate(start, beams, cells, known.get(number))
-        for number, (start, beams) in enumerate(zip(primitives, around, strict=True))
-    ]
-    seen = [one for one in candidates if len(one.beams)]
-    if not seen:
-        return [None] * len(primitives), noise_std
-    sensor = Sensor.of(noise_std or min(guess_std or first_noise(seen), most), span, most=most)
-    with ThreadPoolExecutor(threads) as pool:
-        look_behind(pool, seen, cells, CLEARED_FIRST)
-        fit_all(pool, seen, [True] * len(seen), sensor)
-        alone = _once(seen, candidates[:preferred], sensor)
-        for one in alone:
-            one.look_at(one.beams.passing(one.now, REACH_FITTED))
-        alone = [one for one in alone if len(one.beams)]
-        if not alone:
-            return [None] * len(primitives), noise_std
-        sensor = Sensor.of(noise_std or measured_noise(alone, sensor), span, most=most)
-        for _ in range(rounds):
-            where = [parameters(one.now) for one in alone]
-            changed = look_behind(pool, alone, cells, CLEARED)
-            fit_all(pool, alone, changed, sensor)
-            if all(np.abs(parameters(one.now) - at).max() < SETTLED for one, at in zip(alone, where, strict=True)):
+
+    cells: MapCells
+    noise_std: float | None = None
+    threads: int = 2
+    guessed_noise: float | None = None
+    rounds: int | None = None
+    options: RefinementOptions = field(default_factory=RefinementOptions)
+
+    def run(
+        self,
+        primitives: Sequence[Primitive],
+        scans: Iterable[tuple[Scan, Pose2D]],
+        known: Mapping[int, Detection] | None = None,
+        preferred: int = 0,
+    ) -> list[RefinedPrimitive | None]:
+        """Refine primitives beside each other.
+
+        Args:
+            primitives: the guesses.
+            scans: the scans and the poses of their laser, in the map frame.
+            known: by index, detections whose kind is not asked again.
+            preferred: of duplicates the first so many win against others that explain the rays little better.
+
+        Returns:
+            Each refined, in the order given; None for one that no ray passes, that is the duplicate of another, or
+            that is too large or reaches into a wall.
+        """
+        if not primitives:
+            return []
+        bundles, span, max_noise = collect_rays(scans, primitives, self.options.rays.reach, self.options)
+        detections = known or {}
+        candidates = [
+            Candidate(start, bundle, self.cells, detections.get(number), self.options)
+            for number, (start, bundle) in enumerate(zip(primitives, bundles, strict=True))
+        ]
+        seen = [candidate for candidate in candidates if len(candidate.bundle)]
+        results: dict[int, RefinedPrimitive | None] = {}
+        if seen:
+            with ThreadPoolExecutor(self.threads) as pool:
+                results = self._refine(pool, seen, candidates[:preferred], span, max_noise)
+        return [results.get(id(candidate)) for candidate in candidates]
+
+    def _refine(
+        self, pool: Executor, seen: list[Candidate], preferred: list[Candidate], span: float, max_noise: float
+    ) -> dict[int, RefinedPrimitive | None]:
+        """Search, remove duplicates, fit jointly, estimate the sensor, and compare kinds; results by id."""
+        options, known_noise = self.options, self.noise_std
+        noise = known_noise or min(self.guessed_noise or initial_noise(seen, options.sensor), max_noise)
+        sensor = BeamModel.create(noise, span, max_std=max_noise, options=options.sensor)
+        find_backgrounds(pool, seen, self.cells, options.map.cleared_first)
+        fit_candidates(pool, seen, [True] * len(seen), sensor)
+        single = self._near_rays(without_duplicates(seen, preferred, sensor))
+        if not single:
+            return {}
+        noise = known_noise or estimate_noise(single, sensor)
+        sensor = BeamModel.create(noise, span, max_std=max_noise, options=options.sensor)
+        self._fit_jointly(pool, single, sensor)
+        sensor = estimate_sensor(single, sensor, known_noise)
+        disperses = sensor.dispersion > options.sensor.significant_dispersion
+        fit_candidates(pool, single, [disperses] * len(single), sensor)
+        self.noise_std = sensor.std
+        whole_map = ClearanceMap.of(self.cells.occupied, self.cells.frame)
+        finished = pool.map(lambda item: finish(item, whole_map.background(item.bundle), sensor), single)
+        return {id(candidate): result for candidate, result in zip(single, finished, strict=True)}
+
+    def _near_rays(self, candidates: list[Candidate]) -> list[Candidate]:
+        """Leave out rays that pass far from the fits, and candidates without any."""
+        for candidate in candidates:
+            candidate.keep_rays(candidate.bundle.passing(candidate.current, self.options.rays.fitted_reach))
+        return [candidate for candidate in candidates if len(candidate.bundle)]
+
+    def _fit_jointly(self, pool: Executor, candidates: list[Candidate], sensor: BeamModel) -> None:
+        """Fit all in rounds, each beside what the others were in the round before, until none moves."""
+        for _ in range(self.options.rounds if self.rounds is None else self.rounds):
+            before = [parameters_of(candidate.current) for candidate in candidates]
+            changed = find_backgrounds(pool, candidates, self.cells, self.options.map.cleared)
+            fit_candidates(pool, candidates, changed, sensor)
+            now = [parameters_of(candidate.current) for candidate in candidates]
+            moved = (np.abs(p - at).max() for p, at in zip(now, before, strict=True))
+            if all(change < self.options.converged for change in moved):
                 break
-        sensor = measured(alone, sensor, noise_std)
-        fit_all(pool, alone, [sensor.dispersion > CLEARLY] * len(alone), sensor)
-        whole = Obstacles.of(cells.occupied, cells.frame)
-        refined = list(pool.map(lambda one: finish(one, backdrop(one.beams, whole), sensor), alone))
-    made = {id(one): result for one, result in zip(alone, refined, strict=True)}
-    return [made.get(id(one)) for one in candidates], sensor.std
 
 
-def _once(candidates: Sequence[Candidate], preferred: Sequence[Candidate], sensor: Sensor) -> list[Candidate]:
-    """The candidates without those that stand where a likelier one does, or a preferred one not much less likely."""
-    gains = {id(one): gain_of(one, candidates, sensor) for one in candidates}
-    for one in preferred:
-        if id(one) in gains:
-            gains[id(one)] *= PREFERRED
+def without_duplicates(
+    candidates: Sequence[Candidate], preferred: Sequence[Candidate], sensor: BeamModel
+) -> list[Candidate]:
+    """Remove candidates that stand where one with a larger gain does.
+
+    Args:
+        candidates: the fitted candidates.
+        preferred: those that win against others whose gain is little larger.
+        sensor: the sensor.
+
+    Returns:
+        The rest, largest gain first.
+    """
+    gains = {id(candidate): gain_of(candidate, candidates, sensor) for candidate in candidates}
+    for candidate in preferred:
+        if id(candidate) in gains:
+            gains[id(candidate)] *= candidate.options.acceptance.preference
     stay: list[Candidate] = []
-    for one in sorted(candidates, key=lambda one: -gains[id(one)]):
-        if all(share_of(one.now, other.now) <= SAME for other in stay):
-            stay.append(one)
+    for candidate in sorted(candidates, key=lambda item: -gains[id(item)]):
+        limit = candidate.options.acceptance.max_shared
+        if all(shared_area(candidate.current, other.current) <= limit for other in stay):
+            stay.append(candidate)
     return stay
 
 
-def gain_of(candidate: Candidate, among: Sequence[Candidate], sensor: Sensor) -> float:
-    """By how much (nats) the rays are likelier with the candidate than with nothing in its place."""
-    beams = candidate.seen_before(among, sensor)
-    return float(-beams.rays[MISS].sum() - candidate.fits[0].cost)
+def gain_of(candidate: Candidate, others: Sequence[Candidate], sensor: BeamModel) -> float:
+    """Compute the log-likelihood gain of the rays over nothing in a candidate's place.
 
+    Args:
+        candidate: the candidate.
+        others: the candidates that may occlude it.
+        sensor: the sensor.
 
-def finish(candidate: Candidate, map_alone: Backdrop, sensor: Sensor) -> Refined | None:
-    """Weighs a candidate's kinds and gives the likeliest one's parameters, with their uncertainty."""
-    assert candidate.fitted_to is not None
-    beams = candidate.fitted_to[1]
-    told = weighed(candidate.fits, beams, sensor, candidate.may_be)
-    if told is None:
-        return None
-    gain = float(-beams.rays[MISS].sum() - told.cost)
-    misfit, rays, seen = _held_against_map(told.primitive, beams, map_alone, sensor)
-    chances = candidate.known.chances if candidate.known is not None else None
-    return Refined(told.primitive, told.std, told.covariance, chances or told.chances, gain, misfit, rays, seen)
-
-
-def _held_against_map(
-    primitive: Primitive, beams: Beams, map_alone: Backdrop, sensor: Sensor
-) -> tuple[float, int, float]:
-    """Of the rays that meet a primitive: by how much (nats each) the map explains them better, how many they are, and
-    in what share of the directions around it they meet it.
+    Returns:
+        Nats.
     """
-    distance = distance_to(primitive, beams)
-    meets = distance < beams.rays[STOP]
+    bundle = candidate.rays_with_background(others, sensor)
+    return float(-bundle.rays[BACKGROUND].sum() - candidate.fits[0].cost)
+
+
+def finish(candidate: Candidate, map_alone: Background, sensor: BeamModel) -> RefinedPrimitive | None:
+    """Compare a candidate's kinds and hold the likeliest one against the map alone.
+
+    Args:
+        candidate: the fitted candidate.
+        map_alone: what its rays meet in the map with the candidate's own cells.
+        sensor: the sensor.
+
+    Returns:
+        The result; None where no kind is possible there.
+    """
+    assert candidate.fitted_to is not None
+    bundle = candidate.fitted_to[1]
+    evidence = candidate.options.evidence
+    posterior = compare_kinds(candidate.fits, bundle, sensor, candidate.is_possible, evidence)
+    if posterior is None:
+        return None
+    gain = float(-bundle.rays[BACKGROUND].sum() - posterior.cost)
+    sectors = candidate.options.acceptance.sectors
+    misfit, rays, seen = _compare_with_map(posterior.primitive, bundle, map_alone, sensor, sectors)
+    chances = candidate.known.kind_probabilities if candidate.known is not None else None
+    return RefinedPrimitive(
+        posterior.primitive,
+        posterior.std,
+        posterior.covariance,
+        chances or posterior.chances,
+        gain,
+        misfit,
+        rays,
+        seen,
+    )
+
+
+def _compare_with_map(
+    primitive: Primitive, bundle: RayBundle, map_alone: Background, sensor: BeamModel, sectors: int
+) -> tuple[float, int, float]:
+    """Return of the rays that meet a primitive the misfit (nats a ray), how many they are, and ``seen``."""
+    ranges = ranges_to(primitive, bundle.rays)
+    meets = ranges < bundle.rays[OCCLUSION]
     if not meets.any():
         return 0.0, 0, 0.0
-    met = beams.of(meets)
-    own = np.log(explained(met, distance[meets], np.ones(len(met), np.bool_), 0.0, sensor))
-    free = np.log(explained(met, map_alone.stops[meets], map_alone.ends[meets], map_alone.spread, sensor))
-    x, y = met.rays[:2] + distance[meets] * met.rays[2:4] - [[primitive.x], [primitive.y]]
-    sectors = np.floor(np.arctan2(y, x) / (2 * math.pi) * SECTORS).astype(int) % SECTORS
-    return float((free - own).mean()), len(met), len(np.unique(sectors)) / SECTORS
+    met, cells = bundle.select(meets), map_alone.select(meets)
+    own = np.log(surface_likelihood(met, ranges[meets], np.ones(len(met), np.bool_), 0.0, sensor))
+    free = np.log(surface_likelihood(met, cells.ranges, cells.ends, cells.uncertainty, sensor))
+    x, y = met.rays[:2] + ranges[meets] * met.rays[2:4] - [[primitive.x], [primitive.y]]
+    sector = np.floor(np.arctan2(y, x) / (2 * math.pi) * sectors).astype(int) % sectors
+    return float((free - own).mean()), len(met), len(np.unique(sector)) / sectors

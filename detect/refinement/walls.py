@@ -1,7 +1,7 @@
-"""Straight walls in a map, told from its cells: what stands behind primitives that stand close to one.
+"""Straight walls close behind candidates.
 
-Where a primitive stands close to a wall, few rays come between them, and the map cannot tell them apart. The wall
-goes on straight, though, as it comes out on both sides.
+Where a primitive stands close to a wall, few rays pass between them, and the map cannot separate them. The wall is
+straight, though, as it shows on both sides of the primitive: the stretch between is known.
 """
 
 from __future__ import annotations
@@ -13,39 +13,22 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from detect.refinement.lines import Line, find_lines, middle_line, off_line
-from detect.refinement.map_cells import MapCells, is_within
+from detect.refinement.lines import Line, distance_to_line, find_lines, trimmed_line
+from detect.refinement.map_cells import OUTLINE_POINTS, MapCells, is_within
+from detect.refinement.options import DEFAULTS, WallOptions
 from prim.arrays import FloatArray
 from prim.shapes import Kind, Primitive
-
-CLOSE = 0.12
-"""A wall is looked for behind candidates that come this near (m) to it."""
-
-AROUND = 0.5
-"""Its cells are looked for this far (m) around a candidate."""
-
-LEAST_LENGTH = 0.12
-"""So much (m) of a wall must be seen at both sides."""
-
-OWN = 0.04
-"""Cells this near (m) to a candidate say nothing of a wall's line."""
-
-BENT = 2.0
-"""Its cells lie this near (cells) to its line, along which noise has bent it."""
-
-WALL_CELLS = 3.5
-"""Cells this near (cells) to the stretch stand for it."""
-
-DEPTH = 0.02
-"""How far (m) a primitive may reach into a wall: the wall's line is no surer."""
-
-THICKNESS = 0.002
 
 
 @dataclass(frozen=True)
 class Wall:
-    """A stretch of a wall ``behind`` a candidate (where that was first taken to stand), the line it lies on (its
-    normal points to the candidate's side), and the map's cells that stand for it there (their rows and columns).
+    """A stretch of a wall behind a candidate.
+
+    Attributes:
+        behind: the candidate's guess.
+        stretch: a thin rectangle that stands for the wall there.
+        line: its line; the normal points to the candidate's side.
+        cells: rows and columns of the map's cells that belong to it.
     """
 
     behind: Primitive
@@ -53,64 +36,87 @@ class Wall:
     line: Line
     cells: tuple[NDArray[np.intp], NDArray[np.intp]]
 
-    def is_cut_by(self, primitive: Primitive) -> bool:
-        """Whether a primitive reaches behind the stretch by more than DEPTH: nothing does."""
+    def is_cut_by(self, primitive: Primitive, depth: float = DEFAULTS.walls.depth) -> bool:
+        """Tell whether a primitive reaches behind the stretch.
+
+        Args:
+            primitive: the primitive.
+            depth: by how much (m) more than the line is uncertain.
+
+        Returns:
+            Whether it does.
+        """
         nx, ny, d = self.line
-        outline = primitive.outline(32)
+        outline = primitive.outline(OUTLINE_POINTS)
         along = (outline - (self.stretch.x, self.stretch.y)) @ np.array([-ny, nx])
         behind = d - outline @ np.array([nx, ny])
-        return bool((behind[np.abs(along) < self.stretch.size[0] / 2] > DEPTH).any())
+        return bool((behind[np.abs(along) < self.stretch.size[0] / 2] > depth).any())
 
 
-def walls_behind(cells: MapCells, candidates: Sequence[Primitive], starts: Sequence[Primitive]) -> list[Wall]:
-    """The walls that candidates stand close to, and that come out straight on both sides of each.
+def walls_behind(
+    cells: MapCells,
+    candidates: Sequence[Primitive],
+    guesses: Sequence[Primitive],
+    options: WallOptions = DEFAULTS.walls,
+) -> list[Wall]:
+    """Find the walls that candidates stand close to, and that show straight on both sides of them.
 
-    A wall is seen from the side on which a candidate was first taken to stand: ``starts``.
+    Args:
+        cells: the map.
+        candidates: the candidates as they are known now.
+        guesses: what they were taken for first: a wall is seen from the side on which that stands.
+        options: the numbers.
+
+    Returns:
+        The walls.
     """
     points, resolution = cells.wall_surface, cells.frame.resolution
     if not len(points):
         return []
-    places = np.array([(one.x, one.y) for one in candidates])
+    centroids = np.array([(candidate.x, candidate.y) for candidate in candidates])
     made = []
-    for one, start in zip(candidates, starts, strict=True):
-        reach = one.circumradius + AROUND
-        near = points[_around(one, points, reach)]
-        if not is_within(one, near[_around(one, near, one.circumradius + CLOSE)], CLOSE).any():
+    for candidate, guess in zip(candidates, guesses, strict=True):
+        reach = candidate.circumradius + options.around
+        near = points[_in_square(candidate, points, reach)]
+        close = near[_in_square(candidate, near, candidate.circumradius + options.near)]
+        if not is_within(candidate, close, options.near).any():
             continue
-        for other in np.flatnonzero(_around(one, places, 2 * reach)).tolist():
-            near = near[~is_within(candidates[other], near, OWN)]
-        for rough in find_lines(near, resolution, 2 * LEAST_LENGTH, 2, BENT):
-            nx, ny, d = middle_line(near[off_line(near, rough) < BENT * resolution], resolution)
-            side = 1.0 if nx * start.x + ny * start.y > d else -1.0
-            wall = _stretch(cells, one, start, (side * nx, side * ny, side * d), near)
+        for other in np.flatnonzero(_in_square(candidate, centroids, 2 * reach)).tolist():
+            near = near[~is_within(candidates[other], near, options.own)]
+        for rough in find_lines(near, resolution, 2 * options.min_length, 2, options.width):
+            inliers = near[distance_to_line(near, rough) < options.width * resolution]
+            nx, ny, d = trimmed_line(inliers, resolution)
+            side = 1.0 if nx * guess.x + ny * guess.y > d else -1.0
+            wall = _stretch(cells, candidate, guess, (side * nx, side * ny, side * d), near, options)
             if wall is not None:
                 made.append(wall)
     return made
 
 
-def _around(one: Primitive, points: FloatArray, reach: float) -> NDArray[np.bool_]:
-    """Which points (N, 2) are no further than ``reach`` (m) from a primitive's middle, along either axis."""
-    return np.asarray((np.abs(points - (one.x, one.y)) <= reach).all(axis=1))
+def _in_square(candidate: Primitive, points: FloatArray, reach: float) -> NDArray[np.bool_]:
+    """Tell which points (N, 2) are within ``reach`` (m) of a primitive's centroid along both axes."""
+    return np.asarray((np.abs(points - (candidate.x, candidate.y)) <= reach).all(axis=1))
 
 
-def _stretch(cells: MapCells, candidate: Primitive, start: Primitive, line: Line, points: FloatArray) -> Wall | None:
-    """The stretch of a line behind a candidate; None where the candidate is not close to it."""
+def _stretch(
+    cells: MapCells, candidate: Primitive, guess: Primitive, line: Line, points: FloatArray, options: WallOptions
+) -> Wall | None:
+    """Return the stretch of a line behind a candidate; None where it is not close, or not seen on both sides."""
     nx, ny, d = line
-    gap = float((candidate.outline(32) @ np.array([nx, ny]) - d).min())
-    if gap > CLOSE:
+    gap = float((candidate.outline(OUTLINE_POINTS) @ np.array([nx, ny]) - d).min())
+    if gap > options.near:
         return None
     resolution = cells.frame.resolution
-    on_line = points[off_line(points, line) < (BENT + 0.5) * resolution]
+    on_line = points[distance_to_line(points, line) < (options.width + 0.5) * resolution]
     along = on_line @ np.array([-ny, nx])
     middle = -ny * candidate.x + nx * candidate.y
-    reach = candidate.circumradius
+    reach, beyond = candidate.circumradius, options.beyond
     left, right = along[along < middle - 0.5 * reach], along[along > middle + 0.5 * reach]
-    if min(len(np.unique(np.rint(part / resolution))) for part in (left, right)) * resolution < LEAST_LENGTH:
+    lengths = (len(np.unique(np.rint(part / resolution))) for part in (left, right))
+    if min(lengths) * resolution < options.min_length:
         return None
-    low, high = max(float(left.min()), middle - reach - 0.15), min(float(right.max()), middle + reach + 0.15)
+    low, high = max(float(left.min()), middle - reach - beyond), min(float(right.max()), middle + reach + beyond)
     at = (low + high) / 2
-    theta = math.atan2(nx, -ny)
-    stretch = Primitive(
-        Kind.RECTANGLE, nx * d - ny * at, ny * d + nx * at, theta, (high - low, THICKNESS)
-    ).canonical()
-    return Wall(start, stretch, line, cells.large_within(stretch, WALL_CELLS * resolution))
+    x, y, theta = nx * d - ny * at, ny * d + nx * at, math.atan2(nx, -ny)
+    stretch = Primitive(Kind.RECTANGLE, x, y, theta, (high - low, options.thickness)).canonical()
+    return Wall(guess, stretch, line, cells.large_within(stretch, options.cells * resolution))

@@ -1,4 +1,4 @@
-"""Small rooms with primitives, and scans of them from all sides, made without a recorder."""
+"""Small rooms with primitives, and scans of them from all sides, made without the recorder."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ WALLS = ((-1.0, -1.0, 1.0, -1.0), (1.0, -1.0, 1.0, 1.0), (1.0, 1.0, -1.0, 1.0), 
 
 
 def shape(kind: Kind, x: float = 0.0, y: float = 0.0, theta: float = 0.4) -> Primitive:
-    return Primitive(kind, x, y, None if kind is Kind.CIRCLE else theta, SIZES[kind]).canonical()
+    return Primitive(kind, x, y, theta if kind.has_angle else None, SIZES[kind]).canonical()
 
 
 def room(*primitives: Primitive) -> World:
@@ -55,5 +55,5 @@ def scans(world: World, noise: float, rays: int = 240, stops: int = 8, seed: int
 def mapped(of: list[tuple[Scan, Pose2D]], mapper: str = "forward") -> OccupancyGrid:
     made = make_mapper(mapper, 0.01, (-1.1, -1.1, 1.1, 1.1))
     for scan, pose in of:
-        made.keep(scan, pose)
+        made.accumulate(scan, pose)
     return made.finish()

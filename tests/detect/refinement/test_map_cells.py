@@ -1,4 +1,4 @@
-"""Cells of a map, told apart."""
+"""The classification of a map's cells."""
 
 from __future__ import annotations
 
@@ -8,20 +8,20 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import ndimage
 
-from detect.refinement.lines import middle_line, off_line
+from detect.refinement.lines import distance_to_line, trimmed_line
 from detect.refinement.map_cells import MapCells
 from mapping.grid import GridFrame, OccupancyGrid
-from mapping.morphology import number_connected
+from mapping.morphology import label_components
 from tests.detect.refinement.rooms import mapped, room, scans
 
 
 @given(seed=st.integers(0, 10_000), share=st.floats(0, 0.6), most=st.integers(1, 40))
 @settings(max_examples=50, deadline=None)
-def test_what_hangs_together_is_numbered_as_scipy_does(seed: int, share: float, most: int) -> None:
+def test_connected_components_are_those_of_scipy(seed: int, share: float, most: int) -> None:
     rng = np.random.default_rng(seed)
     occupied = rng.random(rng.integers(1, 60, 2)) < share
     labels, large = np.zeros(occupied.shape, np.int32), np.zeros_like(occupied)
-    number_connected(occupied, float(most), labels, large)
+    label_components(occupied, float(most), labels, large)
     expected, _ = ndimage.label(occupied, np.ones((3, 3)))
     assert (labels == expected).all()
     spans = [max(part.stop - part.start for part in parts) for parts in ndimage.find_objects(expected)]
@@ -29,8 +29,8 @@ def test_what_hangs_together_is_numbered_as_scipy_does(seed: int, share: float, 
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_walls_that_noise_bends_are_walls(seed: int) -> None:
-    """From one end to the other, where the room's are, to within what the map tells; nothing is free behind them."""
+def test_walls_bent_by_noise_are_walls(seed: int) -> None:
+    """Over their whole length, and at the room's edges to within the map's accuracy."""
     cells = MapCells.of(mapped(scans(room(), 0.5, stops=6, seed=seed)))
     assert len(cells.walls) == 4
     for wall in cells.walls:
@@ -39,25 +39,25 @@ def test_walls_that_noise_bends_are_walls(seed: int) -> None:
         assert wall.last - wall.first > 1.8
 
 
-def test_a_sharp_wall_stays_where_it_is_beside_what_stands_on_it() -> None:
+def test_trimmed_line_ignores_what_touches_the_wall() -> None:
     along = np.arange(0.0, 2.0, 0.01)
     wall = np.column_stack((along, 0.3 + 0.1 * along))
     beside = wall[60:110] + np.array([0.0, 0.025])
-    line = middle_line(np.concatenate((wall, beside)), 0.01)
-    assert off_line(wall, line).max() < 0.001
+    line = trimmed_line(np.concatenate((wall, beside)), 0.01)
+    assert distance_to_line(wall, line).max() < 0.001
 
 
-def test_specks_are_no_walls() -> None:
-    """However many of them lie along a line by chance."""
+def test_speckle_has_no_walls() -> None:
+    """Many cells lie along a line by chance."""
     specks = np.random.default_rng(0).random((220, 220)) < 0.06
     grid = OccupancyGrid(GridFrame(0.01, -110, -110, 220, 220), np.where(specks, 0.9, 0.1).astype(np.float32))
     assert not MapCells.of(grid).large.any()
 
 
 @pytest.mark.parametrize("upright", [False, True])
-@pytest.mark.parametrize(("length", "kept", "gap"), [(200, 0.55, 1), (120, 1.0, 40)], ids=["worn", "in pieces"])
-def test_walls_have_holes(length: int, kept: float, gap: int, upright: bool) -> None:
-    """A sharp wall, of whose cells no more than 0.4 m hang together: what is left of it is a wall."""
+@pytest.mark.parametrize(("length", "kept", "gap"), [(200, 0.55, 1), (120, 1.0, 40)], ids=["random holes", "gaps"])
+def test_walls_with_holes_are_walls(length: int, kept: float, gap: int, upright: bool) -> None:
+    """A sharp wall whose connected components are no longer than 0.4 m."""
     wall = np.zeros((220, 220), np.bool_)
     wall[10, 10 : 10 + length] = np.random.default_rng(1).random(length) < kept
     wall[10, ::gap] &= gap == 1

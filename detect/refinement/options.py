@@ -1,0 +1,300 @@
+"""The numbers of refinement, each in one place, with its unit and where it comes from.
+
+Where no source is named a number was set by hand, and is tested only by what ``python -m bench.refine`` measures of
+the whole (docs/refine.md).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+
+@dataclass(frozen=True)
+class RayOptions:
+    """Which rays a candidate is fitted to."""
+
+    max_rays: int = 8000
+    """Rays of one candidate; of more than twice as many every other scan is left out. Bounds the time."""
+    max_range: float = 1000.0
+    """m; a sensor whose range_max is larger, or infinite, is taken to reach so far."""
+    reach: float = 0.07
+    """m; rays that pass a candidate at this distance are collected."""
+    fitted_reach: float = 0.03
+    """m; the same once it is fitted."""
+    similar_nats: float = 0.5
+    """nats; a ray's background has changed where its log-likelihood differs by more."""
+    similar_range: float = 0.01
+    """m; or where its occlusion does."""
+    similar_share: float = 0.01
+    """A candidate is not fitted again where a smaller share of its rays has changed."""
+
+
+@dataclass(frozen=True)
+class SensorOptions:
+    """The likelihood of a beam, and what is found of the sensor from the rays that meet candidates."""
+
+    outlier_share: float = 0.005
+    """Share of ranges that no surface explains, uniform over all ranges."""
+    background_doubt: float = 0.05
+    """Share of rays that the background, as the map has it, does not explain."""
+    no_return_beyond: float = 0.5
+    """Probability that a ray which leaves the map meets nothing at all."""
+    censored_doubt: float = 0.1
+    """Likelihood of a censored measurement (too near, no return) that nothing explains."""
+    noise_scans: int = 40
+    """Scans whose neighbouring beams bound the noise."""
+    max_noise_ratio: float = 2.0
+    """The noise is at most so many times what the differences of neighbouring beams show."""
+    min_max_noise: float = 0.01
+    """m; that bound is no lower."""
+    initial_noise: float = 0.03
+    """m; where too few rays meet candidates to estimate it."""
+    min_initial_noise: float = 0.005
+    """m; lower bound of the first estimate, which contains the errors of the guesses."""
+    min_initial_rays: int = 10
+    """Fewer residuals give no first estimate."""
+    min_noise: float = 0.002
+    """m; lower bound of the noise: ranges and poses in logs are not known better."""
+    min_rays: int = 20
+    """Fewer measured rays give no noise, and fewer scans no dispersion."""
+    min_rays_of_scan: int = 4
+    """Fewer rays of a scan give no mean error of that scan."""
+    max_residual: float = 4.0
+    """Standard deviations; a ray that is off by more met something else."""
+    significant_dispersion: float = 1.1
+    """Scans have a common error where the squares of their mean residuals exceed independent ones by this factor."""
+    stretches: tuple[int, ...] = (3, 10, 30)
+    """Lengths (scans) of the clusters over time for which the sandwich estimate is made."""
+    min_stretches: int = 6
+    """Fewer clusters give no estimate."""
+    significance: float = 3.0
+    """Standard deviations of the mean square of independent scores that the estimate must exceed."""
+    min_score_blur: float = 0.004
+    """m; silhouettes are blurred by this much at least where scores are taken."""
+    footprints: tuple[float, ...] = (0.0, 0.0005, 0.001, 0.002, 0.004, 0.008, 0.016)
+    """m; footprints that are tried; the first two count as none."""
+    same_noise: float = 0.03
+    """Noise that differs by a smaller share does not make fits anew."""
+
+
+@dataclass(frozen=True)
+class Descent:
+    """One stage of a fit: blurs (m) one after the other, at most so many steps at each, and where to end (nats)."""
+
+    blurs: tuple[float, ...]
+    steps: int
+    tolerance: float
+
+
+@dataclass(frozen=True)
+class FitOptions:
+    """Maximum likelihood by Levenberg and Marquardt's method."""
+
+    coarse_rays: int = 800
+    """Rays that starts are fitted to, about."""
+    search_rays: int = 1600
+    """Rays that the best of these are fitted to."""
+    coarse: Descent = Descent((0.03, 0.012), 8, 0.5)
+    """From starts; its first blur exceeds the errors of networks."""
+    fine: Descent = Descent((0.008, 0.001), 10, 0.1)
+    """From the best coarse fits."""
+    last: Descent = Descent((0.012, 0.004, 0.001, 0.0003), 10, 0.1)
+    """From earlier fits, with all rays."""
+    information_blur: float = 0.001
+    """m; information of silhouettes is asked with this blur at least: at narrower ones single jumps count for all."""
+    hopeless_kind: float = 60.0
+    """nats; a kind whose coarse fit is less likely by this much than the best is not fitted to all rays."""
+    hopeless_start: float = 20.0
+    """nats; nor is another fit of one kind."""
+    starts_kept: int = 2
+    """Coarse fits of a kind that are gone on with."""
+    equilateral: float = 1.3
+    """A triangle whose sides differ by a smaller factor may have been fitted with the wrong apex."""
+    stretch: float = 1.03
+    """Factor by which an ellipse's start is longer (and shorter) than the circle that it begins with."""
+    first_damping: float = 1e-2
+    """Levenberg–Marquardt damping at the start."""
+    max_damping: float = 1e4
+    """Damping at which a descent ends."""
+    min_size: float = 0.02
+    """m; bounds of width and height (of semi-axes) during a descent; the recorder draws no smaller ones."""
+    max_size: float = 1.2
+    """m."""
+
+
+@dataclass(frozen=True)
+class EvidenceOptions:
+    """Marginal likelihoods by importance sampling."""
+
+    max_extent: float = 0.7
+    """m; the prior of sizes is uniform up to this extent: twice the recorder's largest (0.32 m), and some."""
+    contender: float = 7.0
+    """nats; kinds within this of the best one's Laplace approximation are sampled: e^-7 is below 0.1 %."""
+    samples: tuple[int, ...] = (300, 300, 600)
+    """Samples in each round."""
+    degrees: float = 6.0
+    """Degrees of freedom of the proposal, Student's t: heavier tails than the posterior's."""
+    min_effective: float = 0.15
+    """Effective share of samples, in all rounds but the last, below which weights are tempered."""
+    min_effective_last: float = 0.06
+    """The same in the last round."""
+    min_std: tuple[float, ...] = (1e-4, 1e-4, 1e-3, 1e-4, 1e-4)
+    """m, m, rad, m, m; lower bounds of the proposal's standard deviations."""
+    max_turn: float = 0.5
+    """rad; upper bound of its standard deviation in angle."""
+    sure_deviations: float = 4.0
+    """Standard deviations within which a ray's hit or miss must not change to be summed up once."""
+    same_sizes: float = 0.0005
+    """m; sizes that differ by less make a square of a rectangle: no pose is known better."""
+    out_of_question: float = 30.0
+    """nats (times the dispersion); a kind whose evidence is less by this much is not fitted again."""
+
+
+@dataclass(frozen=True)
+class MapOptions:
+    """Which cells of a map belong to walls, and which may belong to primitives."""
+
+    max_extent: float = 0.75
+    """m; connected components that extend further are no primitives: somewhat above EvidenceOptions.max_extent."""
+    min_wall: float = 0.8
+    """m; a straight line with surface cells over this length is a wall: longer than any primitive."""
+    max_walls: int = 16
+    """Walls looked for in a map."""
+    wall_width: float = 3.0
+    """cells; noise bends a wall: its surface cells lie this near to its line …"""
+    wall_density: float = 0.7
+    """… over this share of its length at least (lines through speckle have half of that),"""
+    sharp_width: float = 1.0
+    """cells; or they lie this near …"""
+    sharp_density: float = 0.4
+    """… over this share: mappers wear holes into walls seen at a slant."""
+    wall_cells: float = 3.0
+    """cells; occupied cells this near to a wall's line belong to it."""
+    wall_depth: float = 0.4
+    """m; a wall that is free on one side only reaches so far to the other."""
+    one_sided: float = 0.2
+    """Share of free cells, of the other side's, below which a side is not free."""
+    penetration: float = 0.025
+    """m; what reaches further behind such a wall is no primitive."""
+    touching: float = 0.008
+    """m; a wall's cells this near to a primitive count as the primitive's."""
+    moved_range: float = 0.05
+    """m; a background has changed where rays end elsewhere by more …"""
+    moved_share: float = 0.1
+    """… for more than this share of them."""
+    cleared_first: float = 0.03
+    """m; occupied cells around a candidate that are its own, before it is fitted."""
+    cleared: float = 0.02
+    """m; and afterwards."""
+    occluder_distance: float = 2.5
+    """m; candidates further apart do not occlude each other: few rays pass both."""
+
+
+@dataclass(frozen=True)
+class LineOptions:
+    """Straight lines by RANSAC."""
+
+    trials: int = 60
+    """Pairs of points tried for a line: where half of the points are on it, all miss it in 3 of 10^8 cases."""
+    max_points: int = 4000
+    """Points that are looked at; of more, a random sample. Bounds the time."""
+    min_inliers: float = 8.0
+    """Points of a line."""
+    baseline: float = 8.0
+    """Widths by which a pair is apart at least: the line through nearer points is too uncertain."""
+    refits: int = 3
+    """Fits of a line to the points within …"""
+    medians: float = 2.0
+    """… so many median distances."""
+
+
+@dataclass(frozen=True)
+class WallOptions:
+    """Straight walls behind candidates that stand close to them."""
+
+    near: float = 0.12
+    """m; a wall is looked for behind candidates this near to it,"""
+    around: float = 0.5
+    """m; by its cells this far around,"""
+    min_length: float = 0.12
+    """m; seen over this length on both sides,"""
+    own: float = 0.04
+    """m; leaving out cells this near to a candidate."""
+    width: float = 2.0
+    """cells; its cells lie this near to its line, along which noise has bent it."""
+    cells: float = 3.5
+    """cells; cells this near to the stretch stand for it."""
+    depth: float = 0.02
+    """m; a primitive may reach so far into it: its line is known no better."""
+    thickness: float = 0.002
+    """m; of the rectangle that stands for it."""
+    beyond: float = 0.15
+    """m; that reaches so far beyond a candidate on both sides."""
+
+
+@dataclass(frozen=True)
+class ProposalOptions:
+    """Candidates from the map that the networks did not find."""
+
+    max_proposals: int = 24
+    """The largest components that are proposed: a map full of speckle has many."""
+    min_extent: float = 0.03
+    """m; smallest extent of a component."""
+    max_extent: float = 0.7
+    """m; largest one: EvidenceOptions.max_extent."""
+    min_cells: int = 6
+    """Cells of a component."""
+    max_covered: float = 0.3
+    """Share of a component's cells within a known primitive from which on it is part of that."""
+    min_free: float = 0.3
+    """Share of the cells around it that are free: what lies behind a wall is not seen."""
+    near: float = 0.03
+    """m; cells this near to a primitive count as within it."""
+
+
+@dataclass(frozen=True)
+class AcceptanceOptions:
+    """What a candidate needs to be a detection."""
+
+    min_gain: float = 25.0
+    """nats; log-likelihood gain of the rays over an empty place."""
+    max_misfit: float = 0.25
+    """nats a ray; by which the map alone explains the rays that meet it better."""
+    max_relative_std: float = 0.25
+    """Standard deviation of a size, as a share of it."""
+    min_seen: float = 0.35
+    """Share of the directions around it in which rays meet it; of candidates that the networks did not find."""
+    sectors: int = 24
+    """Directions around the centroid that this is counted in."""
+    min_chance: float = 0.33
+    """Posterior probability of its kind; of such candidates."""
+    min_shared: float = 0.25
+    """Share of the smaller area that the fit has in common with the guess; of such candidates."""
+    max_shared: float = 0.25
+    """Two candidates that share more of the smaller one's area are duplicates."""
+    preference: float = 1.5
+    """Of duplicates one that the networks found wins against others whose gain is larger by a smaller factor."""
+    sure: float = 0.95
+    """A detection of an earlier pass whose kind has this posterior probability keeps it."""
+
+
+@dataclass(frozen=True)
+class RefinementOptions:
+    """All numbers of refinement."""
+
+    rays: RayOptions = field(default_factory=RayOptions)
+    sensor: SensorOptions = field(default_factory=SensorOptions)
+    fit: FitOptions = field(default_factory=FitOptions)
+    evidence: EvidenceOptions = field(default_factory=EvidenceOptions)
+    map: MapOptions = field(default_factory=MapOptions)
+    lines: LineOptions = field(default_factory=LineOptions)
+    walls: WallOptions = field(default_factory=WallOptions)
+    proposals: ProposalOptions = field(default_factory=ProposalOptions)
+    acceptance: AcceptanceOptions = field(default_factory=AcceptanceOptions)
+    rounds: int = 2
+    """Joint fits of all candidates once duplicates are gone."""
+    converged: float = 0.002
+    """m, rad; rounds end where no parameter moves by more."""
+
+
+DEFAULTS = RefinementOptions()

@@ -1,0 +1,246 @@
+"""What the rays that meet candidates say of the sensor: range noise, footprint, dispersion."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from detect.refinement.candidates import Candidate
+from detect.refinement.evidence import exact_costs
+from detect.refinement.geometry import NUMBERS, OUTLINES, TIES, ranges_to
+from detect.refinement.kernels import MEASURED, OCCLUSION, PARAMETERS, RANGE, gradient, upper_tail
+from detect.refinement.options import DEFAULTS, SensorOptions
+from detect.refinement.rays import RayBundle
+from detect.refinement.sensor_model import BeamModel, table_nearest
+from prim.arrays import FloatArray
+from prim.shapes import Primitive
+
+NORMAL_MAD = 1.4826
+"""The standard deviation of a normal distribution over its median absolute deviation."""
+
+
+def initial_noise(candidates: Sequence[Candidate], options: SensorOptions = DEFAULTS.sensor) -> float:
+    """Estimate the noise before any fit, robustly: the median absolute residual from the guesses' surfaces.
+
+    Args:
+        candidates: the candidates.
+        options: the bounds.
+
+    Returns:
+        Metres.
+    """
+    residuals = np.concatenate([_residuals(candidate.bundle, candidate.start) for candidate in candidates])
+    if len(residuals) < options.min_initial_rays:
+        return options.initial_noise
+    return max(NORMAL_MAD * float(np.median(np.abs(residuals))), options.min_initial_noise)
+
+
+def _residuals(bundle: RayBundle, primitive: Primitive) -> FloatArray:
+    """Return the residuals (m) of measured ranges whose rays meet a primitive."""
+    ranges = ranges_to(primitive, bundle.rays)
+    hit = (ranges < bundle.max_range) & (bundle.outcomes == MEASURED)
+    return np.asarray(bundle.rays[RANGE, hit] - ranges[hit])
+
+
+def estimate_sensor(candidates: Sequence[Candidate], sensor: BeamModel, noise_std: float | None) -> BeamModel:
+    """Estimate noise, footprint and dispersion from all candidates together.
+
+    Args:
+        candidates: the fitted candidates.
+        sensor: the sensor so far.
+        noise_std: the range noise (m) where it is known.
+
+    Returns:
+        The sensor.
+    """
+    std = noise_std or estimate_noise(candidates, sensor)
+    sensor = BeamModel.create(std, sensor.span, sensor.footprint, 1.0, sensor.max_std, sensor.options)
+    footprint = estimate_footprint(candidates, sensor)
+    dispersion = scan_dispersion(candidates, sensor)
+    if footprint > 0 or dispersion > sensor.options.significant_dispersion:
+        with_footprint = replace(sensor, footprint=footprint)
+        dispersion = max(dispersion, clustered_dispersion(candidates, with_footprint))
+    return BeamModel.create(std, sensor.span, footprint, dispersion, sensor.max_std, sensor.options)
+
+
+def estimate_footprint(candidates: Sequence[Candidate], sensor: BeamModel) -> float:
+    """Find the footprint that makes the rays near candidates' silhouettes most likely.
+
+    Args:
+        candidates: the fitted candidates.
+        sensor: the sensor.
+
+    Returns:
+        Metres; 0 where the best one is not clearly above it.
+    """
+    footprints = sensor.options.footprints
+    widest = footprints[-1]
+    totals = np.zeros(len(footprints))
+    for candidate in candidates:
+        bundle, fit = candidate.rays_with_background(candidates, sensor), candidate.fits[0]
+        at_edge = bundle.passing(candidate.current, widest) & ~bundle.passing(candidate.current, -widest)
+        bundle = bundle.select(at_edge)
+        for k, footprint in enumerate(footprints):
+            cost = exact_costs(fit.kind, fit.p[None], bundle, replace(sensor, footprint=footprint))[0]
+            totals[k] += cost if np.isfinite(cost) else 0.0  # larger than the prior allows: no information
+    return float(footprints[best]) if (best := int(np.argmin(totals))) > 1 else 0.0
+
+
+def scan_dispersion(candidates: Sequence[Candidate], sensor: BeamModel) -> float:
+    """Estimate the dispersion of scans: the factor by which mean residuals of scans scatter beyond independent rays.
+
+    Args:
+        candidates: the fitted candidates.
+        sensor: the sensor.
+
+    Returns:
+        1 or more.
+    """
+    options = sensor.options
+    squares, scans = 0.0, 0
+    for candidate in candidates:
+        bundle = candidate.rays_with_background(candidates, sensor)
+        ranges = ranges_to(candidate.current, bundle.rays)
+        error = (bundle.rays[RANGE] - ranges) / sensor.std
+        clear = ranges < bundle.rays[OCCLUSION]
+        clear &= (bundle.outcomes == MEASURED) & (np.abs(error) < options.max_residual)
+        cut = np.minimum((bundle.max_range - sensor.span - ranges) / sensor.std, 0.0)
+        error = _without_truncation(error, cut)
+        count = np.bincount(bundle.scan[clear])
+        total = np.bincount(bundle.scan[clear], error[clear])
+        many = count >= options.min_rays_of_scan
+        squares += float((total[many] ** 2 / count[many]).sum())
+        scans += int(np.count_nonzero(many))
+    return max(squares / scans, 1.0) if scans >= options.min_rays else 1.0
+
+
+def clustered_dispersion(candidates: Sequence[Candidate], sensor: BeamModel) -> float:
+    """Estimate the dispersion of stretches of scans, in which poses may be off together.
+
+    The scores (gradients of the log-likelihood by a candidate's parameters) of stretches scatter more than the
+    information of their rays says: a sandwich estimate clustered by time (Liang and Zeger 1986), for several lengths,
+    of which the largest significant one counts.
+
+    Args:
+        candidates: the fitted candidates.
+        sensor: the sensor.
+
+    Returns:
+        1 or more.
+    """
+    options = sensor.options
+    bundles = [candidate.rays_with_background(candidates, sensor) for candidate in candidates]
+    pairs = zip(candidates, bundles, strict=True)
+    scores = [score for pair in pairs if (score := _scan_scores(*pair, sensor)) is not None]
+    largest = 1.0
+    for length in options.stretches:
+        squares, freedom = 0.0, 0
+        for score in scores:
+            stretches = len(score) // length
+            if stretches < options.min_stretches:
+                continue
+            sums = score[: stretches * length].reshape(stretches, length, -1).sum(axis=1)
+            sums -= sums.mean(axis=0)
+            whole = len(score) / (stretches * length) * stretches**2 / (stretches - 1)
+            squares += float((sums**2).sum()) * whole
+            freedom += sums.size
+        if freedom and (found := squares / freedom) > 1 + options.significance * math.sqrt(2 / freedom):
+            largest = max(largest, found)
+    return largest
+
+
+def _scan_scores(candidate: Candidate, bundle: RayBundle, sensor: BeamModel) -> FloatArray | None:
+    """Return the whitened score (S, K) of each scan's rays by a candidate's own parameters.
+
+    Independent rays give each a mean square of 1 / S. None where the information is singular.
+    """
+    fit = candidate.fits[0]
+    tie, blur = TIES[fit.kind], max(sensor.footprint, sensor.options.min_score_blur)
+
+    def score_and_information(part: RayBundle) -> tuple[FloatArray, FloatArray]:
+        slope, information = np.zeros(PARAMETERS), np.zeros((PARAMETERS, PARAMETERS))
+        gradient(OUTLINES, NUMBERS[fit.kind], fit.p, sensor.data(part), blur, slope, information)
+        return tie.T @ slope, tie.T @ information @ tie
+
+    try:
+        whiten = np.linalg.inv(np.linalg.cholesky(score_and_information(bundle)[1]))
+    except np.linalg.LinAlgError:
+        return None
+    scans, number = np.unique(bundle.scan, return_inverse=True)
+    parts = (bundle.select(number == k) for k in range(len(scans)))
+    return np.array([whiten @ score_and_information(part)[0] for part in parts])
+
+
+def _without_truncation(error: FloatArray, cut: FloatArray) -> FloatArray:
+    """Standardise errors (N,) of normal distributions that are truncated below ``cut`` (N,) to mean 0, variance 1."""
+    tail = np.exp(-(cut**2) / 2) / math.sqrt(2 * math.pi) / upper_tail(cut)
+    return np.asarray((error - tail) / np.sqrt(1 + cut * tail - tail**2))
+
+
+def estimate_noise(candidates: Sequence[Candidate], sensor: BeamModel) -> float:
+    """Find the noise that makes the rays which meet candidates most likely, censored measurements among them.
+
+    Args:
+        candidates: the fitted candidates.
+        sensor: the sensor so far.
+
+    Returns:
+        Metres.
+    """
+    met = [_met(candidate, candidate.rays_with_background(candidates, sensor)) for candidate in candidates]
+    return maximum_likelihood_noise(met, sensor)
+
+
+def maximum_likelihood_noise(
+    met: Sequence[tuple[FloatArray, NDArray[np.int8], FloatArray]], sensor: BeamModel
+) -> float:
+    """Find the noise that makes measurements of known surfaces most likely.
+
+    Args:
+        met: ranges to the surfaces (m), outcomes, and measured ranges or their limits (m), each (N,).
+        sensor: the sensor so far; its noise stays where too few ranges were measured.
+
+    Returns:
+        Metres.
+    """
+    ranges, outcomes, z = (np.concatenate(part) for part in zip(*met, strict=True))
+    count = int(np.count_nonzero(outcomes == MEASURED))
+    if count < sensor.options.min_rays:
+        return sensor.std
+
+    def cost(log_std: float) -> float:
+        std = math.exp(log_std)
+        table = BeamModel.create(std, sensor.span, options=sensor.options).table
+        return count * log_std - float(table_nearest(table, outcomes, (ranges - z) / std).sum())
+
+    std = math.exp(_minimize(cost, math.log(sensor.std)))
+    return min(max(std, sensor.options.min_noise), sensor.max_std)
+
+
+def _met(candidate: Candidate, bundle: RayBundle) -> tuple[FloatArray, NDArray[np.int8], FloatArray]:
+    """Return the ranges (m) at which rays meet a candidate, their outcomes, and measured ranges or limits (m)."""
+    ranges = ranges_to(candidate.current, bundle.rays)
+    meets = (ranges < bundle.rays[OCCLUSION]) & (ranges < bundle.max_range)
+    return ranges[meets], bundle.outcomes[meets], bundle.rays[RANGE, meets]
+
+
+def _minimize(cost: Callable[[float], float], at: float, step: float = 0.5) -> float:
+    """Minimise a unimodal function: steps downhill, then a parabola through three points, twice."""
+    here = cost(at)
+    for _ in range(12):
+        left, right = cost(at - step), cost(at + step)
+        if min(left, right) >= here:
+            curve = left + right - 2 * here
+            at += 0.5 * step * (left - right) / curve if curve > 0 else 0.0
+            if step < 0.1:
+                return at
+            step, here = step / 6, cost(at)
+        elif left < right:
+            at, here = at - step, left
+        else:
+            at, here = at + step, right
+    return at

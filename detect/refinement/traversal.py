@@ -1,0 +1,95 @@
+"""The compiled kernels that follow rays through a map's cells: distances to occupied cells, and ranges to them.
+
+Compiled code is cached beside this file and made anew when this file changes, so that nothing that stands elsewhere
+may be compiled in.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+from prim.compiled import compiled
+
+kernel = compiled(inline="never", fastmath={"arcp", "contract", "reassoc", "nsz"})
+
+ORIGIN_X, ORIGIN_Y, DIRECTION_X, DIRECTION_Y = range(4)
+"""Rows of rays (7, N), as in detect.refinement.kernels."""
+
+FAR = 1e30
+MAX_CLEARANCE = 255
+"""Clearances are stored in one byte."""
+
+
+@kernel
+def chessboard_distances(occupied: Any, out: Any) -> None:
+    """Compute the chessboard distance (cells) of each cell to the nearest occupied one, or to beyond the map.
+
+    The two passes of Rosenfeld and Pfaltz (1966).
+
+    Args:
+        occupied: (rows, cols) bool.
+        out: (rows, cols) uint8 gets the distances, at most MAX_CLEARANCE.
+    """
+    rows, cols = occupied.shape
+    for r in range(rows):
+        for c in range(cols):
+            near = 0
+            if r > 0 and 0 < c < cols - 1:
+                near = min(out[r - 1, c - 1], out[r - 1, c], out[r - 1, c + 1], out[r, c - 1])
+            out[r, c] = 0 if occupied[r, c] else min(near + 1, MAX_CLEARANCE)
+    for r in range(rows - 1, -1, -1):
+        for c in range(cols - 1, -1, -1):
+            near = 0
+            if r < rows - 1 and 0 < c < cols - 1:
+                near = min(out[r + 1, c - 1], out[r + 1, c], out[r + 1, c + 1], out[r, c + 1])
+            out[r, c] = min(out[r, c], near + 1)
+
+
+@kernel
+def cast_through_map(clear: Any, grid: Any, rays: Any, max_ranges: Any, ranges: Any, ends: Any) -> None:
+    """Find where rays end in a map: in the first occupied cell, or where they leave it.
+
+    Over free space as many cells are taken at once as the clearance allows.
+
+    Args:
+        clear: (rows, cols) of :func:`chessboard_distances`.
+        grid: row and column of the plane's cell at which the map begins, and 1 / resolution (1 / m).
+        rays: (7, N).
+        max_ranges: (N,) of the sensors (m).
+        ranges: (N,) gets the ranges (m).
+        ends: (N,) gets whether the ray ends in an occupied cell.
+    """
+    row, col, inverse_resolution = grid
+    rows, cols = clear.shape
+    for i in range(len(ranges)):
+        x, y = rays[ORIGIN_X, i] * inverse_resolution - col, rays[ORIGIN_Y, i] * inverse_resolution - row
+        dx, dy = rays[DIRECTION_X, i], rays[DIRECTION_Y, i]
+        far = max_ranges[i] * inverse_resolution
+        c, r = math.floor(x), math.floor(y)
+        step_c, step_r = (1 if dx > 0 else -1), (1 if dy > 0 else -1)
+        first_c, first_r = (1 if dx > 0 else 0), (1 if dy > 0 else 0)
+        per_c = 1.0 / dx if dx != 0.0 else FAR
+        per_r = 1.0 / dy if dy != 0.0 else FAR
+        per_cell = min(abs(per_c), abs(per_r))
+        at, ends[i] = 0.0, False
+        while at < far:
+            next_c = (c + first_c - x) * per_c if dx != 0.0 else FAR
+            next_r = (r + first_r - y) * per_r if dy != 0.0 else FAR
+            if 0 <= c < cols and 0 <= r < rows:
+                free = clear[r, c]
+                if free == 0:
+                    at, ends[i] = 0.5 * (at + min(next_c, next_r)), True
+                    break
+                if free > 2:
+                    at += (free - 1) * per_cell
+                    c, r = math.floor(x + at * dx), math.floor(y + at * dy)
+                    continue
+            elif (c < 0 and dx <= 0) or (c >= cols and dx >= 0) or (r < 0 and dy <= 0) or (r >= rows and dy >= 0):
+                break
+            at = min(next_c, next_r)
+            if next_c <= next_r:
+                c += step_c
+            else:
+                r += step_r
+        ranges[i] = min(at, far) / inverse_resolution
