@@ -1,1 +1,1 @@
-"""Grid to primitives: what is seen on an occupancy grid, and how the networks that see it are made."""
+"""From occupancy grids to primitives: detection, refinement and tracking, and training and evaluation of networks."""

@@ -1,4 +1,4 @@
-"""prim-train and prim-eval: the command lines of training and of evaluation."""
+"""Command lines of training and of evaluation: prim-train and prim-eval."""
 
 from __future__ import annotations
 
@@ -8,62 +8,51 @@ from collections.abc import Sequence
 from enum import StrEnum
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from detect.evaluation.modes import RecordingMode
 from prim import __version__, console
+from prim.choices import MapperName
 from prim.errors import UsageError
+
+if TYPE_CHECKING:
+    from prim.shapes import Kind
+
+ALL = "all"
+"""Stands for all kinds."""
 
 train = typer.Typer(add_completion=False, rich_markup_mode=None, no_args_is_help=True)
 
 
-class MapperName(StrEnum):
-    """The mappers."""
+class ImageSource(StrEnum):
+    """What YOLO is trained on: the maps of a mapper, or drawings."""
 
-    DET = "det"
-    PROB = "prob"
-    FORWARD = "forward"
-
-
-class ImagesName(StrEnum):
-    """What YOLO can learn from: a mapper's maps, or drawings."""
-
-    DET = "det"
-    PROB = "prob"
-    FORWARD = "forward"
+    DET = MapperName.DET.value
+    PROB = MapperName.PROB.value
+    FORWARD = MapperName.FORWARD.value
     DRAWINGS = "drawings"
 
 
-class KindName(StrEnum):
-    """The kinds of primitives, and all of them."""
-
-    ALL = "all"
-    SQUARE = "square"
-    RECTANGLE = "rectangle"
-    CIRCLE = "circle"
-    TRIANGLE = "triangle"
-    ELLIPSE = "ellipse"
-
-
-class SetName(StrEnum):
-    """The presets of sets."""
+class DatasetPreset(StrEnum):
+    """Presets of data sets: keys of detect.training.dataset.DATASET_PRESETS."""
 
     PAPER = "paper"
     MIXED = "mixed"
     LARGE = "large"
 
 
-class PresetName(StrEnum):
-    """The presets of training."""
+class CnnPreset(StrEnum):
+    """Presets of the parameter networks' training: keys of detect.training.train.CNN_PRESETS."""
 
     PRIM = "prim"
     PAPER = "paper"
     MORE = "more"
 
 
-class YoloPresetName(StrEnum):
-    """The presets of YOLO's training."""
+class YoloPreset(StrEnum):
+    """Presets of YOLO's training: keys of detect.training.train.YOLO_PRESETS."""
 
     PRIM = "prim"
     PAPER = "paper"
@@ -95,13 +84,17 @@ def _main(
 @train.command()
 def dataset(
     folder: Annotated[Path, typer.Argument(metavar="FOLDER", help="Where the set is made, or gone on with.")],
-    preset: Annotated[SetName, typer.Option(help="What it holds, where no other option says.")] = SetName.PAPER,
+    preset: Annotated[
+        DatasetPreset, typer.Option(help="What it holds, where no other option says.")
+    ] = DatasetPreset.PAPER,
     maps: Annotated[
         tuple[int, int] | None, typer.Option(metavar="TRAIN VAL", help="Sessions to train on and to validate on.")
     ] = None,
     noise_std: Annotated[list[float] | None, typer.Option(metavar="M", help="Range noise, metres; repeat.")] = None,
     mapper: Annotated[list[MapperName] | None, typer.Option(help="A mapper; repeat. [default: all]")] = None,
-    kind: Annotated[list[KindName] | None, typer.Option(help="A kind of primitive; repeat. [default: all]")] = None,
+    kind: Annotated[
+        list[str] | None, typer.Option(metavar="KIND", help="A kind of primitive; repeat. [default: all]")
+    ] = None,
     seed: Annotated[int | None, typer.Option(metavar="N", help="The first session's seed.")] = None,
     workers: Annotated[int | None, typer.Option(metavar="N", help="Processes. [default: one a core]")] = None,
     quiet: Annotated[bool, typer.Option("--quiet", help="Print errors only.")] = False,
@@ -111,20 +104,20 @@ def dataset(
 
     A set that was interrupted goes on where it stopped; the same options make the same set.
     """
-    from detect.training.dataset import PRESETS, make
+    from detect.training.dataset import DATASET_PRESETS, make_dataset
 
     given: dict[str, Any] = {
         "sizes": maps,
         "noise_stds": tuple(noise_std) if noise_std else None,
         "mappers": tuple(name.value for name in mapper) if mapper else None,
-        "kinds": tuple(name.value for name in kinds_of(kind)) if kind else None,
+        "kinds": tuple(chosen.value for chosen in parse_kinds(kind)) if kind else None,
         "seed": seed,
     }
     options = dataclasses.replace(
-        PRESETS[preset.value], **{name: value for name, value in given.items() if value is not None}
+        DATASET_PRESETS[preset.value], **{name: value for name, value in given.items() if value is not None}
     )
     with console.progress_bar("sessions", quiet) as progress:
-        made = make(folder, options, progress, workers)
+        made = make_dataset(folder, options, progress, workers)
     if not quiet:
         typer.echo(
             f"made {made} of {sum(options.sizes)} sessions in {folder} ({sum(options.sizes) - made} were there)"
@@ -157,10 +150,8 @@ def cnn(
     data: Annotated[Path, typer.Argument(metavar="SET", help="A set made by prim-train dataset.")],
     output: Annotated[Path, typer.Argument(metavar="FOLDER", help="Where checkpoints go: cnn.MAPPER[.KIND].pt.")],
     mapper: Annotated[MapperName, typer.Option(help="Whose maps to learn from.")] = MapperName.FORWARD,
-    kind: Annotated[KindName, typer.Option(help="The kind, or kinds, to read.")] = KindName.ALL,
-    preset: Annotated[
-        PresetName, typer.Option(help="Ours, the paper's settings, or more of ours.")
-    ] = PresetName.PRIM,
+    kind: Annotated[str, typer.Option(metavar="KIND", help="The kind, or kinds, to read.")] = ALL,
+    preset: Annotated[CnnPreset, typer.Option(help="Ours, the paper's settings, or more of ours.")] = CnnPreset.PRIM,
     epochs: Annotated[
         int | None, typer.Option(metavar="N", help="Passes over the set. [default: the preset's]")
     ] = None,
@@ -175,23 +166,24 @@ def cnn(
 
     Ours is one network for all kinds; the paper's are one for each.
     """
-    need_extra()
-    from detect.training.train import CNN_PRESETS, checkpoint_name, networks_of, train_cnn
+    require_training_extra()
+    from detect.training.train import CNN_PRESETS, checkpoint_name, network_kinds, train_cnn
     from prim.shapes import Kind
 
     options = dataclasses.replace(CNN_PRESETS[preset.value], seed=seed, start=start)
     if epochs is not None:
         options = dataclasses.replace(options, epochs=epochs)
+    groups = network_kinds(options.preset, parse_kinds([kind]))
     output.mkdir(parents=True, exist_ok=True)
-    for kinds in networks_of(options.preset, [Kind(name.value) for name in kinds_of([kind])]):
+    for kinds in groups:
         name = "cnn" if len(kinds) == len(Kind) else "-".join(kinds)
 
-        def tell(done: int, total: int, loss: float, validation: float, name: str = name) -> None:
+        def report_epoch(done: int, total: int, loss: float, validation: float, name: str = name) -> None:
             if not quiet:
                 typer.echo(f"{name}: epoch {done} of {total}, loss {loss:.5f}, validation {validation:.5f}")
 
         path = output / checkpoint_name(mapper.value, kinds)
-        train_cnn(data, mapper.value, kinds, path, options, tell)
+        train_cnn(data, mapper.value, kinds, path, options, report_epoch)
     return 0
 
 
@@ -199,10 +191,10 @@ def cnn(
 def yolo(
     data: Annotated[Path, typer.Argument(metavar="SET", help="A set made by prim-train dataset.")],
     output: Annotated[Path, typer.Argument(metavar="FOLDER", help="Where ultralytics leaves its run.")],
-    mapper: Annotated[ImagesName, typer.Option(help="Whose maps to learn from.")] = ImagesName.FORWARD,
+    mapper: Annotated[ImageSource, typer.Option(help="Whose maps to learn from.")] = ImageSource.FORWARD,
     preset: Annotated[
-        YoloPresetName, typer.Option(help="Ours, the paper's settings, one for drawings, or more of ours.")
-    ] = YoloPresetName.PRIM,
+        YoloPreset, typer.Option(help="Ours, the paper's settings, one for drawings, or more of ours.")
+    ] = YoloPreset.PRIM,
     epochs: Annotated[
         int | None, typer.Option(metavar="N", help="Passes over the set. [default: the preset's]")
     ] = None,
@@ -214,7 +206,7 @@ def yolo(
     debug: Annotated[bool, typer.Option("--debug", help="Show tracebacks.")] = False,
 ) -> int:
     """Train YOLOv5 to find the primitives. An interrupted run goes on."""
-    need_extra()
+    require_training_extra()
     from detect.training.train import YOLO_PRESETS, train_yolo
 
     options = dataclasses.replace(YOLO_PRESETS[preset.value], seed=seed, start=start, trust=trust)
@@ -226,7 +218,7 @@ def yolo(
 
 
 class StageName(StrEnum):
-    """The stages of detection."""
+    """Stages of the detector."""
 
     YOLO = "yolo"
     CNN = "cnn"
@@ -246,24 +238,24 @@ def export(
     debug: Annotated[bool, typer.Option("--debug", help="Show tracebacks.")] = False,
 ) -> int:
     """Make an ONNX file with a model card of trained weights."""
-    need_extra()
-    from detect.training.dataset import style_of
+    require_training_extra()
+    from detect.training.dataset import image_style
     from detect.training.export import export_cnn, export_yolo
-    from detect.training.recipe import put_thresholds
+    from detect.training.recipe import store_thresholds
 
     if stage is StageName.CNN:
         export_cnn(weights, mapper.value, output)
     else:
         if data is None:
             raise UsageError("YOLO's thresholds are chosen on the set it was trained on: name it with --set")
-        export_yolo(weights, mapper.value, output, trust, style_of(data, mapper.value))
-        put_thresholds(output, data)
+        export_yolo(weights, mapper.value, output, trust, image_style(data, mapper.value))
+        store_thresholds(output, data)
     typer.echo(f"wrote: {output}")
     return 0
 
 
 @train.command(name="all")
-def every(
+def train_everything(
     work: Annotated[Path, typer.Argument(metavar="FOLDER", help="Where sets, training and weights are kept.")],
     mapper: Annotated[list[MapperName] | None, typer.Option(help="A mapper; repeat. [default: all]")] = None,
     debug: Annotated[bool, typer.Option("--debug", help="Show tracebacks.")] = False,
@@ -272,29 +264,19 @@ def every(
 
     Takes hours, and says how long each part took; an interrupted run goes on.
     """
-    need_extra()
-    from detect.training.recipe import make_all
+    require_training_extra()
+    from detect.training.recipe import train_all
 
-    for made in make_all(work, [name.value for name in mapper or list(MapperName)], typer.echo):
-        typer.echo(f"made: {made}")
+    for folder in train_all(work, [name.value for name in mapper or list(MapperName)], typer.echo):
+        typer.echo(f"made: {folder}")
     return 0
 
 
 evaluation = typer.Typer(add_completion=False, rich_markup_mode=None)
 
 
-class WayName(StrEnum):
-    """The ways of recording that the shipped weights are measured with."""
-
-    WARPED = "warped"
-    DRIVEN = "driven"
-    NO_WALLS = "no walls"
-    FEW_RAYS = "180 rays"
-    MANY_RAYS = "1000 rays"
-
-
 class SuiteName(StrEnum):
-    """The suites of evaluation."""
+    """Suites of the evaluation."""
 
     PAPER = "paper"
     SHIPPED = "shipped"
@@ -316,7 +298,8 @@ def _evaluate(
         list[MapperName] | None, typer.Option(help="Of --suite shipped: a mapper; repeat. [default: all]")
     ] = None,
     recorded: Annotated[
-        list[WayName] | None, typer.Option(help="Of --suite shipped: a way of recording; repeat. [default: all]")
+        list[RecordingMode] | None,
+        typer.Option(help="Of --suite shipped: a way of recording; repeat. [default: all]"),
     ] = None,
     output: Annotated[
         Path | None, typer.Option(metavar="FOLDER", help="Where the report goes. [default: report, in FOLDER]")
@@ -335,7 +318,7 @@ def _evaluate(
     shipped.md, shipped.csv.
     """
 
-    def say(text: str) -> None:
+    def announce(text: str) -> None:
         if not quiet:
             typer.echo(text)
 
@@ -344,41 +327,61 @@ def _evaluate(
         given = {"--weights": weights, "--mapper": mapper, "--recorded": recorded}
         for name in (name for name, value in given.items() if value is not None):
             raise UsageError(f"{name} goes with --suite shipped")
-        need_extra()
-        from detect.evaluation.suites import Suite
-        from detect.evaluation.tables import report
+        require_training_extra()
+        from detect.evaluation.suites import PaperSuite
+        from detect.evaluation.tables import write_paper_report
 
-        made = Suite(work, say)
-        written = report(made.measured() if so_far else made.run(), folder)
+        paper = PaperSuite(work, announce)
+        written = write_paper_report(paper.results() if so_far else paper.run(), folder)
     else:
         from detect.evaluation.suites import ShippedSuite
-        from detect.evaluation.tables import report_shipped
+        from detect.evaluation.tables import write_shipped_report
+        from detect.networks.weights import SHIPPED
 
-        shipped = ShippedSuite(work, weights or Path(__file__).parent / "shipped", say)
-        mappers, ways = ([one.value for one in chosen] for chosen in (mapper or MapperName, recorded or WayName))
-        written = report_shipped(shipped.measured() if so_far else shipped.run(sessions, mappers, ways), folder)
+        shipped = ShippedSuite(work, weights or SHIPPED, announce)
+        mappers, modes = (
+            [name.value for name in names] for names in (mapper or MapperName, recorded or RecordingMode)
+        )
+        results = shipped.results() if so_far else shipped.run(sessions, mappers, modes)
+        written = write_shipped_report(results, folder)
     for path in written:
-        say(f"wrote: {path}")
+        announce(f"wrote: {path}")
     return 0
 
 
-def need_extra() -> None:
-    """Raises UsageError where torch and ultralytics are not installed."""
+def require_training_extra() -> None:
+    """Check that the extra ``[train]`` is installed.
+
+    Raises:
+        UsageError: torch or ultralytics is missing.
+
+    """
     missing = [name for name in ("torch", "ultralytics") if find_spec(name) is None]
     if missing:
         raise UsageError(f"training needs {' and '.join(missing)}: pip install -e '.[train]', where prim was cloned")
 
 
-def kinds_of(names: Sequence[KindName]) -> list[KindName]:
-    """The kinds named; all of them where one name is ``all``."""
-    return [name for name in KindName if name is not KindName.ALL and (name in names or KindName.ALL in names)]
+def parse_kinds(names: Sequence[str]) -> list[Kind]:
+    """Return the named kinds in the table's order; all of them where one name is ``all``.
+
+    Raises:
+        UsageError: There is no kind of some name.
+
+    """
+    from prim.shapes import Kind
+
+    known = [kind.value for kind in Kind]
+    for name in names:
+        if name not in (ALL, *known):
+            raise UsageError(f"--kind {name}: there is no such kind; choose from {', '.join((ALL, *known))}")
+    return [kind for kind in Kind if kind.value in names or ALL in names]
 
 
 def main() -> None:
-    """The entry point of prim-train."""
+    """Run prim-train."""
     sys.exit(console.run(train, "prim-train", sys.argv[1:]))
 
 
 def main_eval() -> None:
-    """The entry point of prim-eval."""
+    """Run prim-eval."""
     sys.exit(console.run(evaluation, "prim-eval", sys.argv[1:]))

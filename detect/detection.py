@@ -1,4 +1,4 @@
-"""What detection comes to: primitives with scores and uncertainty, and candidates that were rejected."""
+"""Results of detection: primitives with scores and uncertainties, and rejected candidates."""
 
 from __future__ import annotations
 
@@ -13,12 +13,17 @@ from prim.shapes import Kind, Primitive
 
 @dataclass(frozen=True)
 class Detection:
-    """A primitive with its ``score`` (0 to 1), YOLO's ``box`` (m: x0, y0, x1, y1), and the ``crop`` (pixels, pixels)
-    that its parameters were read from.
+    """A detected primitive.
 
-    Where it was refined by rays (detect.refinement), ``std`` (m, rad) tells by name how sure its parameters are, and
-    ``chances`` of what kind it is: the score is then its kind's, the box its outline's, and the crop is empty where
-    the networks had not found it.
+    Attributes:
+        primitive: Kind and parameters, map frame.
+        score: Confidence, 0 to 1: the class score of YOLO; after refinement the posterior probability of the kind.
+        box: Bounding box x0, y0, x1, y1 (m): YOLO's; after refinement that of the outline.
+        crop: Grey image (pixels, pixels) that the parameters were estimated from; (0, 0) where the networks had not
+            detected the primitive.
+        std: Standard deviations (m, rad) of the parameters by name; None where nothing was refined.
+        kind_probabilities: Posterior probabilities of the kinds; None where nothing was refined.
+
     """
 
     primitive: Primitive
@@ -26,14 +31,21 @@ class Detection:
     box: tuple[float, float, float, float]
     crop: NDArray[np.uint8]
     std: Mapping[str, float] | None = None
-    chances: Mapping[Kind, float] | None = None
+    kind_probabilities: Mapping[Kind, float] | None = None
 
 
 @dataclass(frozen=True)
 class Rejection:
-    """A candidate that is no detection: kind, score, where its box has its middle (m), and by which threshold.
+    """A candidate that was rejected.
 
-    ``fitted``: what the rays make of it, where they make anything of it.
+    Attributes:
+        kind: Kind of the candidate.
+        score: Its class score, 0 to 1.
+        x: Centre of its box (m), map frame.
+        y: The same along y.
+        reason: Which test it failed, in words and numbers.
+        fitted: The primitive fitted to its rays; None where refinement fitted none.
+
     """
 
     kind: Kind
@@ -46,9 +58,14 @@ class Rejection:
 
 @dataclass(frozen=True)
 class Detections:
-    """What was found in a map, best first, and what was not taken for a primitive.
+    """Detections and rejected candidates of one map.
 
-    ``doubtful``: of what was rejected, what scored too little and nothing else: the rays may speak for it.
+    Attributes:
+        found: Detections in descending order of score.
+        rejected: Rejected candidates in descending order of score.
+        doubtful: Candidates that were rejected for their score alone, with their rejections (which are in
+            ``rejected`` too): refinement decides about them.
+
     """
 
     found: tuple[Detection, ...]

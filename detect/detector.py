@@ -1,4 +1,4 @@
-"""From a map to primitives: tiles, boxes, crops, parameters (the paper's III-C), on ONNX Runtime."""
+"""From a map to primitives on ONNX Runtime: tiles, boxes, crops, parameters (the paper's III-C)."""
 
 from __future__ import annotations
 
@@ -13,43 +13,58 @@ import numpy as np
 from numpy.typing import NDArray
 
 from detect.detection import Detection, Detections, Rejection
-from detect.networks.cnn import Estimator, Found
-from detect.networks.tiles import TILE, cut, tiles, window
-from detect.networks.weights import Weights, load_set
-from detect.networks.yolo import KINDS, Boxes, Yolo, overlap, suppress
+from detect.networks.cnn import BoxedKind, ParameterEstimator
+from detect.networks.tiles import TILE_SIZE, crop_to_tile, tile_frames, tile_image
+from detect.networks.weights import Weights, load_weight_set
+from detect.networks.yolo import KINDS, Boxes, Yolo, box_iou, non_maximum_suppression
 from mapping.grid import GridFrame, OccupancyGrid
 from prim.errors import UsageError
 from prim.metrics import polygon_areas
 from prim.shapes import Primitive
 
-DOUBTFUL = 0.08
-"""What scores less than its kind's threshold, but this much at least, is left to the rays to judge."""
 
-MOST_DOUBTFUL = 24
-"""No more than so many are: the best."""
+@dataclass(frozen=True)
+class DetectorOptions:
+    """Parameters of the detector; score thresholds come from the model card of the weights."""
 
-FLOOR = 0.05
-"""What YOLO gives a lower score than this is no candidate."""
+    score_floor: float = 0.05
+    """Smallest score of a candidate; set by hand."""
 
-DEFAULT_THRESHOLD = 0.25
-"""The least score of a kind whose card names none: YOLOv5's own."""
+    default_threshold: float = 0.25
+    """Smallest score of a detection of a kind whose model card names none: YOLOv5's default."""
 
-OVERLAP_LIMIT = 0.45
-"""Of two candidates that overlap by more than this (IoU), the better stays: YOLOv5's own."""
+    doubtful_score: float = 0.08
+    """Smallest score of candidates below their kind's threshold that are passed on to refinement; set by hand."""
 
-COVER_LIMIT = 0.25
-"""Of two measured outlines that share more than this (of the smaller one's area), the better stays."""
+    max_doubtful: int = 24
+    """Largest number of these, the best; set by hand: it bounds the time of refinement."""
 
-EDGE = 2
-"""A box that comes this near (cells) to a tile's border, where the map goes on, is left to the next tile."""
+    nms_iou: float = 0.45
+    """Largest intersection over union of two detections' boxes: YOLOv5's default."""
 
-BATCH = 8
-"""Tiles that go through the network at once: what bounds memory."""
+    max_cover: float = 0.25
+    """Largest overlap of two detections' outlines, as a share of the smaller one's area; set by hand."""
+
+    border: int = 2
+    """Boxes this near (cells) to a tile's border, where the map goes on, are left to the next tile; set by hand."""
+
+    batch_size: int = 8
+    """Tiles in one batch of the network: it bounds memory; set by hand."""
+
+
+DEFAULTS = DetectorOptions()
 
 
 @dataclass(frozen=True)
-class _Looked:
-    """A tile, its grey image (TILE, TILE), and the candidates in it, in the plane's cells."""
+class _TileCandidates:
+    """Candidates in one tile.
+
+    Attributes:
+        tile: The tile's frame.
+        grey: Its grey image (TILE_SIZE, TILE_SIZE).
+        boxes: The candidates, in cells of the plane (those of the frames' rows and columns).
+
+    """
 
     tile: GridFrame
     grey: NDArray[np.uint8]
@@ -61,173 +76,223 @@ Scored = TypeVar("Scored", Detection, Rejection)
 
 
 class Detector:
-    """Finds primitives in maps of one mapper; see :meth:`load`."""
+    """A detector of primitives in the maps of one mapper; see :meth:`load`.
 
-    def __init__(self, yolo: Weights, networks: Sequence[Weights]) -> None:
-        """Raises WeightsError where a network is not what its card says."""
+    Attributes:
+        card: Model card of YOLO.
+        yolo: The network that finds boxes.
+        estimator: The networks that estimate parameters from crops.
+        thresholds: Smallest score of a detection of each kind.
+        options: Further parameters.
+
+    """
+
+    def __init__(self, yolo: Weights, networks: Sequence[Weights], options: DetectorOptions = DEFAULTS) -> None:
+        """Check the networks against their model cards.
+
+        Args:
+            yolo: The network that finds boxes.
+            networks: The networks that estimate parameters, at least one for each kind.
+            options: Further parameters.
+
+        Raises:
+            WeightsError: A network is not what its model card says.
+
+        """
         self.card = yolo.card
         self.yolo = Yolo(yolo)
-        self.estimator = Estimator(networks)
-        self.thresholds = {kind: float(yolo.card.thresholds.get(kind, DEFAULT_THRESHOLD)) for kind in KINDS}
+        self.estimator = ParameterEstimator(networks)
+        self.options = options
+        default = options.default_threshold
+        self.thresholds = {kind: float(yolo.card.thresholds.get(kind, default)) for kind in KINDS}
 
     @classmethod
     def load(cls, path: Path, mapper: str | None = None, threads: int | None = None) -> Detector:
-        """A detector from a folder of weights, or YOLO's file in it. Raises WeightsError on what cannot be used."""
-        return cls(*load_set(path, mapper, threads))
+        """Load a detector.
+
+        Args:
+            path: A folder of weights, or YOLO's file in it.
+            mapper: The mapper whose maps it must read; None: any.
+            threads: Threads that run each network; None: one for each core.
+
+        Returns:
+            The detector.
+
+        Raises:
+            WeightsError: The weights cannot be used.
+
+        """
+        return cls(*load_weight_set(path, mapper, threads))
 
     def detect(self, grid: OccupancyGrid) -> Detections:
-        """The primitives in a map.
+        """Detect the primitives in a map.
 
-        Raises UsageError on a map of another resolution than the networks were trained on.
+        Raises:
+            UsageError: The map has another resolution than those that the networks were trained on.
+
         """
         if not np.isclose(grid.frame.resolution, self.card.resolution, rtol=1e-6):
-            wanted, got = self.card.resolution, grid.frame.resolution
-            raise UsageError(f"the detector reads maps with cells of {wanted:g} m, not {got:g} m")
-        return self.detect_images(
-            ((tile, cut(grid, tile, self.card.style)) for tile in _worth_a_look(grid)), grid.frame
-        )
+            expected, actual = self.card.resolution, grid.frame.resolution
+            raise UsageError(f"the detector reads maps with cells of {expected:g} m, not {actual:g} m")
+        tiles = _occupied_tiles(grid)
+        return self.detect_tiles(((tile, tile_image(grid, tile, self.card.style)) for tile in tiles), grid.frame)
 
-    def detect_images(self, images: Iterable[tuple[GridFrame, NDArray[np.uint8]]], frame: GridFrame) -> Detections:
-        """The primitives in a map that is given as its tiles' images (TILE, TILE, 3); ``frame`` is the map's."""
-        looked = list(self._look(images))
-        boxes = Boxes.joined([one.boxes for one in looked])
-        of = [one for one in looked for _ in range(len(one.boxes))]
-        least = np.array([self.thresholds[KINDS[kind]] for kind in boxes.kind.tolist()], np.float32)
+    def detect_tiles(self, images: Iterable[tuple[GridFrame, NDArray[np.uint8]]], frame: GridFrame) -> Detections:
+        """Detect the primitives in a map that is given as images of its tiles.
+
+        Args:
+            images: Frames of tiles and their images (TILE_SIZE, TILE_SIZE, 3).
+            frame: The map's frame.
+
+        Returns:
+            Detections, rejected and doubtful candidates.
+
+        """
+        parts = list(self._candidates(images))
+        boxes = Boxes.concatenate([part.boxes for part in parts])
+        part_of = [part for part in parts for _ in range(len(part.boxes))]
+        thresholds = np.array([self.thresholds[KINDS[kind]] for kind in boxes.kind.tolist()], np.float32)
         whole = np.array(
-            [_is_whole(box, one.tile, frame) for box, one in zip(boxes.box, of, strict=True)], dtype=bool
+            [self._is_whole(box, part.tile, frame) for box, part in zip(boxes.box, part_of, strict=True)], dtype=bool
         )
-        better = _suppressed(boxes, whole & (boxes.score >= least), [len(one.boxes) for one in looked])
-        kept = np.flatnonzero(better == np.arange(len(boxes)))
-        detections, overlapping = _apart(_best_first(self._measured(kept, boxes, of, frame)))
+        suppressor = self._suppress(boxes, whole & (boxes.score >= thresholds), [len(part.boxes) for part in parts])
+        kept = np.flatnonzero(suppressor == np.arange(len(boxes)))
+        measured = _best_first(self._estimate(kept, boxes, part_of, frame))
+        found, overlapping = _reject_overlapping(measured, self.options.max_cover)
         rejections = {
-            i: _rejection(boxes, i, frame, self._reason(boxes, i, by, bool(whole[i])))
-            for i, by in enumerate(better.tolist())
-            if by != i
+            i: _rejection(boxes, i, frame, self._reason(boxes, i, better, bool(whole[i])))
+            for i, better in enumerate(suppressor.tolist())
+            if better != i
         }
-        maybe = _doubtful(boxes, whole & (better < 0), kept)
-        doubtful = zip(self._measured(maybe, boxes, of, frame), [rejections[i] for i in maybe.tolist()], strict=True)
-        return Detections(detections, _best_first([*overlapping, *rejections.values()]), tuple(doubtful))
+        chosen = self._doubtful(boxes, whole & (suppressor < 0), kept)
+        doubtful = zip(
+            self._estimate(chosen, boxes, part_of, frame), [rejections[i] for i in chosen.tolist()], strict=True
+        )
+        return Detections(found, _best_first([*overlapping, *rejections.values()]), tuple(doubtful))
 
-    def _measured(
-        self, chosen: NDArray[np.intp], boxes: Boxes, of: Sequence[_Looked], frame: GridFrame
+    def _candidates(self, images: Iterable[tuple[GridFrame, NDArray[np.uint8]]]) -> Iterator[_TileCandidates]:
+        """Run YOLO on tiles; yield those with candidates."""
+        for batch in _batches(iter(images), self.options.batch_size):
+            stacked = np.stack([image for _, image in batch])
+            for (tile, image), boxes in zip(batch, self.yolo(stacked, self.options.score_floor), strict=True):
+                if len(boxes):
+                    grey = np.ascontiguousarray(image[..., 0])
+                    yield _TileCandidates(tile, grey, boxes.translated(tile.col, tile.row))
+
+    def _is_whole(self, box: NDArray[np.float32], tile: GridFrame, frame: GridFrame) -> bool:
+        """Return whether a box (cells of the plane) is clear of its tile's borders where the map goes on."""
+        left, top, right, bottom = box.tolist()
+        border = self.options.border
+        truncated = (
+            frame.col < tile.col and left < tile.col + border,
+            frame.row < tile.row and top < tile.row + border,
+            frame.col + frame.cols > tile.col + TILE_SIZE and right > tile.col + TILE_SIZE - border,
+            frame.row + frame.rows > tile.row + TILE_SIZE and bottom > tile.row + TILE_SIZE - border,
+        )
+        return not any(truncated)
+
+    def _suppress(self, boxes: Boxes, eligible: NDArray[np.bool_], per_tile: Sequence[int]) -> NDArray[np.intp]:
+        """Suppress within each tile first, then what remains across tiles; see :func:`non_maximum_suppression`."""
+        suppressor = np.full(len(boxes), -1, np.intp)
+        first = 0
+        for count in per_tile:
+            own = np.arange(first, first + count)
+            inner = non_maximum_suppression(boxes[own], self.options.nms_iou, eligible=eligible[own])
+            suppressor[own] = np.where(inner >= 0, inner + first, -1)
+            first += count
+        rest = np.flatnonzero(suppressor == np.arange(len(boxes)))
+        if len(per_tile) > 1:
+            suppressor[rest] = rest[non_maximum_suppression(boxes[rest], self.options.nms_iou)]
+        return suppressor
+
+    def _estimate(
+        self, chosen: NDArray[np.intp], boxes: Boxes, part_of: Sequence[_TileCandidates], frame: GridFrame
     ) -> list[Detection]:
-        """Some of the candidates with the parameters that are read from their crops."""
-        found = [_found(of[i], boxes, i) for i in chosen.tolist()]
+        """Return some candidates with parameters estimated from their crops."""
+        boxed = [_boxed_kind(part_of[i], boxes, i) for i in chosen.tolist()]
         return [
-            Detection(primitive, float(boxes.score[i]), _metres(boxes, i, frame), self.estimator.crop(one))
-            for i, one, primitive in zip(chosen.tolist(), found, self.estimator(found), strict=True)
+            Detection(primitive, float(boxes.score[i]), _box_in_metres(boxes, i, frame), self.estimator.crop(item))
+            for i, item, primitive in zip(chosen.tolist(), boxed, self.estimator(boxed), strict=True)
         ]
 
-    def _look(self, images: Iterable[tuple[GridFrame, NDArray[np.uint8]]]) -> Iterator[_Looked]:
-        """What YOLO sees in tiles, where it sees anything."""
-        for batch in _batches(iter(images)):
-            for (tile, image), seen in zip(
-                batch, self.yolo(np.stack([image for _, image in batch]), FLOOR), strict=True
-            ):
-                if len(seen):
-                    yield _Looked(tile, np.ascontiguousarray(image[..., 0]), seen.moved(tile.col, tile.row))
+    def _doubtful(self, boxes: Boxes, eligible: NDArray[np.bool_], kept: NDArray[np.intp]) -> NDArray[np.intp]:
+        """Return the best candidates with too small a score that no kept one overlaps, in descending order."""
+        options = self.options
+        eligible = eligible & (boxes.score >= options.doubtful_score)
+        for i in kept.tolist():
+            eligible &= box_iou(boxes.box[i], boxes.box) <= options.nms_iou
+        suppressor = non_maximum_suppression(boxes, options.nms_iou, eligible=eligible)
+        best = np.flatnonzero(suppressor == np.arange(len(boxes)))
+        return best[np.argsort(-boxes.score[best], kind="stable")][: options.max_doubtful]
 
-    def _reason(self, boxes: Boxes, i: int, by: int, whole: bool) -> str:
-        """Why a candidate is no detection."""
-        if by >= 0:
-            return f"overlaps a better {KINDS[boxes.kind[by]]} by more than {OVERLAP_LIMIT:g} (IoU)"
+    def _reason(self, boxes: Boxes, i: int, suppressor: int, whole: bool) -> str:
+        """Return why a candidate is rejected."""
+        if suppressor >= 0:
+            better = KINDS[boxes.kind[suppressor]]
+            return f"overlaps a better {better} by more than {self.options.nms_iou:g} (IoU)"
         if not whole:
-            return f"within {EDGE} cells of its tile's border: the next tile holds it whole"
+            return f"within {self.options.border} cells of its tile's border: the next tile holds it whole"
         kind = KINDS[boxes.kind[i]]
         return f"score {boxes.score[i]:.2f} is below {self.thresholds[kind]:.2f}, the least for a {kind}"
 
 
-def _suppressed(boxes: Boxes, among: NDArray[np.bool_], per_tile: Sequence[int]) -> NDArray[np.intp]:
-    """As :func:`suppress`: within each tile first, and then what is left across their seams."""
-    by = np.full(len(boxes), -1, np.intp)
-    first = 0
-    for count in per_tile:
-        own = np.arange(first, first + count)
-        inner = suppress(boxes[own], OVERLAP_LIMIT, among=among[own])
-        by[own] = np.where(inner >= 0, inner + first, -1)
-        first += count
-    left = np.flatnonzero(by == np.arange(len(boxes)))
-    if len(per_tile) > 1:
-        by[left] = left[suppress(boxes[left], OVERLAP_LIMIT)]
-    return by
-
-
-def _doubtful(boxes: Boxes, among: NDArray[np.bool_], kept: NDArray[np.intp]) -> NDArray[np.intp]:
-    """Candidates that score too little, but are none of what was kept and the best of their place."""
-    among = among & (boxes.score >= DOUBTFUL)
-    for i in kept.tolist():
-        among &= overlap(boxes.box[i], boxes.box) <= OVERLAP_LIMIT
-    best = np.flatnonzero(suppress(boxes, OVERLAP_LIMIT, among=among) == np.arange(len(boxes)))
-    return best[np.argsort(-boxes.score[best], kind="stable")][:MOST_DOUBTFUL]
-
-
-def _apart(measured: Sequence[Detection]) -> tuple[tuple[Detection, ...], list[Rejection]]:
-    """Those, of detections best first, whose outlines keep clear of better ones: two things are not in one place."""
-    stay: list[int] = []
+def _reject_overlapping(
+    detections: Sequence[Detection], max_cover: float
+) -> tuple[tuple[Detection, ...], list[Rejection]]:
+    """Split detections, best first, into those whose outlines are clear of better ones and the rejected rest."""
+    kept: list[Detection] = []
     rejected = []
-    for i, one in enumerate(measured):
-        shared = [_covered(one.primitive, measured[k].primitive) for k in stay]
-        if max(shared, default=0.0) <= COVER_LIMIT:
-            stay.append(i)
+    for detection in detections:
+        cover = [_cover(detection.primitive, other.primitive) for other in kept]
+        if max(cover, default=0.0) <= max_cover:
+            kept.append(detection)
             continue
-        better = measured[stay[int(np.argmax(shared))]].primitive.kind
-        reason = f"its outline covers that of a better {better} by more than {COVER_LIMIT:g} of the smaller one"
-        x0, y0, x1, y1 = one.box
-        rejected.append(Rejection(one.primitive.kind, one.score, (x0 + x1) / 2, (y0 + y1) / 2, reason))
-    return tuple(measured[i] for i in stay), rejected
+        better = kept[int(np.argmax(cover))].primitive.kind
+        reason = f"its outline covers that of a better {better} by more than {max_cover:g} of the smaller one"
+        x0, y0, x1, y1 = detection.box
+        kind = detection.primitive.kind
+        rejected.append(Rejection(kind, detection.score, (x0 + x1) / 2, (y0 + y1) / 2, reason))
+    return tuple(kept), rejected
 
 
-def _covered(a: Primitive, b: Primitive) -> float:
-    """How much two outlines share, of the smaller one's area."""
-    if math.hypot(a.x - b.x, a.y - b.y) > sum(max(one.width_height) for one in (a, b)):
+def _cover(a: Primitive, b: Primitive) -> float:
+    """Return the area that two outlines share, as a share of the smaller one's."""
+    if math.hypot(a.x - b.x, a.y - b.y) > sum(max(primitive.width_height) for primitive in (a, b)):
         return 0.0
     first, second, shared = polygon_areas(a, b)
     return shared / min(first, second)
 
 
-def _found(looked: _Looked, boxes: Boxes, i: int) -> Found:
-    """A candidate as the estimator takes it."""
-    tile = looked.tile
+def _boxed_kind(part: _TileCandidates, boxes: Boxes, i: int) -> BoxedKind:
+    """Return a candidate as the estimator takes it."""
+    tile = part.tile
     left, top, right, bottom = boxes.box[i].tolist()
     box = (left - tile.col, top - tile.row, right - tile.col, bottom - tile.row)
-    return Found(looked.grey, tile, box, KINDS[boxes.kind[i]])
+    return BoxedKind(part.grey, tile, box, KINDS[boxes.kind[i]])
 
 
-def _best_first(of: Iterable[Scored]) -> tuple[Scored, ...]:
-    return tuple(sorted(of, key=lambda one: -one.score))
+def _best_first(items: Iterable[Scored]) -> tuple[Scored, ...]:
+    return tuple(sorted(items, key=lambda item: -item.score))
 
 
-def _worth_a_look(grid: OccupancyGrid) -> Iterator[GridFrame]:
-    """The tiles with anything occupied in them."""
-    for tile in tiles(grid.frame):
-        part = window(grid, tile)
+def _occupied_tiles(grid: OccupancyGrid) -> Iterator[GridFrame]:
+    """Yield the tiles that hold occupied cells."""
+    for tile in tile_frames(grid.frame):
+        part = crop_to_tile(grid, tile)
         if part is not None and part.occupied.any():
             yield tile
 
 
-def _batches(of: Iterator[Item]) -> Iterator[list[Item]]:
-    while batch := list(islice(of, BATCH)):
+def _batches(items: Iterator[Item], size: int) -> Iterator[list[Item]]:
+    while batch := list(islice(items, size)):
         yield batch
 
 
-def _is_whole(box: NDArray[np.float32], tile: GridFrame, frame: GridFrame) -> bool:
-    """Whether a box (plane's cells) keeps off those borders of its tile beyond which the map goes on."""
-    left, top, right, bottom = box.tolist()
-    cut_off = (
-        frame.col < tile.col and left < tile.col + EDGE,
-        frame.row < tile.row and top < tile.row + EDGE,
-        frame.col + frame.cols > tile.col + TILE and right > tile.col + TILE - EDGE,
-        frame.row + frame.rows > tile.row + TILE and bottom > tile.row + TILE - EDGE,
-    )
-    return not any(cut_off)
-
-
-def _metres(boxes: Boxes, i: int, frame: GridFrame) -> tuple[float, float, float, float]:
-    """A candidate's box in metres."""
+def _box_in_metres(boxes: Boxes, i: int, frame: GridFrame) -> tuple[float, float, float, float]:
     left, bottom, right, top = (float(value) * frame.resolution for value in boxes.box[i])
     return left, bottom, right, top
 
 
 def _rejection(boxes: Boxes, i: int, frame: GridFrame, reason: str) -> Rejection:
-    left, bottom, right, top = _metres(boxes, i, frame)
+    left, bottom, right, top = _box_in_metres(boxes, i, frame)
     return Rejection(KINDS[boxes.kind[i]], float(boxes.score[i]), (left + right) / 2, (bottom + top) / 2, reason)

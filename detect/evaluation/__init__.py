@@ -1,1 +1,1 @@
-"""How good detections are: metrics, suites, tables."""
+"""Evaluation of detectors: metrics, suites of experiments, tables."""

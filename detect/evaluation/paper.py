@@ -1,4 +1,4 @@
-"""The paper's own numbers (Tables I and II), to stand beside ours."""
+"""The paper's results (Tables I and II), for comparison."""
 
 from __future__ import annotations
 
@@ -6,8 +6,15 @@ from dataclasses import dataclass
 
 
 @dataclass(frozen=True)
-class Row:
-    """A map set of the tables: the noise levels n trained and tested on, and the mapper."""
+class PaperRow:
+    """A row of the tables.
+
+    Attributes:
+        train: Noise level n of the training maps.
+        test: Noise level n of the test maps.
+        mapper: Name of the mapper.
+
+    """
 
     train: float
     test: float
@@ -15,20 +22,20 @@ class Row:
 
 
 ROWS = (
-    Row(0, 0, "det"),
-    Row(0, 0.05, "det"),
-    Row(0.05, 0.05, "det"),
-    Row(0.05, 0.075, "det"),
-    Row(0.05, 0.1, "det"),
-    Row(0.05, 0.05, "prob"),
-    Row(0.05, 0.075, "prob"),
-    Row(0.05, 0.1, "prob"),
+    PaperRow(0, 0, "det"),
+    PaperRow(0, 0.05, "det"),
+    PaperRow(0.05, 0.05, "det"),
+    PaperRow(0.05, 0.075, "det"),
+    PaperRow(0.05, 0.1, "det"),
+    PaperRow(0.05, 0.05, "prob"),
+    PaperRow(0.05, 0.075, "prob"),
+    PaperRow(0.05, 0.1, "prob"),
 )
 
 SHAPES = ("all", "square", "rectangle", "triangle", "circle", "ellipse")
 
-TESTED = 125
-"""Test images; the tables' inference times are of all of them."""
+TEST_IMAGES = 125
+"""Number of test images; the tables' inference times are of all of them."""
 
 TABLE_1 = {
     ROWS[0]: (
@@ -96,7 +103,7 @@ TABLE_1 = {
         (0.116, 0.125, 0.045, 0.125, 0.036),
     ),
 }
-"""F1, mAP at 0.5, mAP at 0.5-0.95, AUC, inference time (s, all test images); one line for each of SHAPES."""
+"""F1, mAP 0.5, mAP 0.5-0.95, AUC, inference time (s, all test images); one line for each of SHAPES."""
 
 TABLE_2 = {
     ROWS[0]: (

@@ -1,8 +1,8 @@
-"""Recorded sessions from one end to the other, as a replay goes: mapped, looked at, refined by the log's rays.
+"""Evaluation on recorded sessions, as a replay processes them: mapped, detected, refined by the log's rays.
 
-Networks are measured as YOLOv5's own evaluation does: every candidate of every kind counts with its score, those
-below the thresholds as well. What is refined is measured alike: every primitive that was fitted to rays counts as
-each kind with the chance of that kind, and where it was no detection in the end, with a share of it.
+The networks are evaluated by the protocol of YOLOv5's validation: every candidate of every kind counts with its
+score, those below the thresholds too. Refinement is evaluated alike: every primitive fitted to rays counts as each
+kind with that kind's posterior probability, and with a share of it where it was rejected in the end.
 """
 
 from __future__ import annotations
@@ -18,111 +18,185 @@ import numpy as np
 
 from detect.detection import Detection, Detections
 from detect.detector import Detector
-from detect.evaluation.box_metrics import Marked, score_boxes
-from detect.evaluation.evaluate import Pictured, errors_of, found_rates, mark
-from detect.networks.tiles import cut, tiles
+from detect.evaluation.box_metrics import score_boxes
+from detect.evaluation.evaluate import (
+    PrimitivePair,
+    matched_pairs,
+    parameter_errors,
+    precision_recall_f1,
+    scored_candidates,
+)
+from detect.networks.tiles import tile_frames, tile_image
 from detect.networks.yolo import KINDS, Boxes
 from detect.refinement.refine import refine_detections
-from detect.training.dataset import MARGIN, Sample, SetOptions, held_in, map_scans, recorded, session_options
+from detect.training.dataset import (
+    DatasetOptions,
+    Sample,
+    map_frame,
+    map_scans,
+    primitives_in_tile,
+    session_options,
+    simulate_session,
+)
+from detect.training.matches import LabelledImage, ScoredBoxes
 from mapping.forward.mapper import cores
-from mapping.grid import GridFrame
 from prim.arrays import FloatArray
-from prim.metrics import match_primitives
-from prim.shapes import Primitive
+from prim.shapes import Kind, Primitive
 
-LEAST_CHANCE = 0.001
-"""A kind that is less likely than this does not count: as little as candidates that are not looked at."""
+MIN_PROBABILITY = 0.001
+"""Smallest probability that a kind counts with: the score floor of YOLOv5's validation."""
 
-RIGHT_AFTER_ALL = 0.1
-"""What was fitted and is no detection in the end counts with this share of its chances: seldom is it there."""
+REJECTED_WEIGHT = 0.1
+"""Weight of the probabilities of primitives that were fitted and rejected: they seldom are there. Set by hand."""
+
+CELLS_PER_METRE = 100
+"""Boxes of primitives are given in cells of 10 mm."""
 
 
 @dataclass(frozen=True)
-class Told:
-    """What was told of a session: scored boxes beside the true ones; what was found, with the truth it stands for
-    (kind right, outlines overlap by half); how many were told in all, and how many there are.
+class SessionScore:
+    """Detections of a session compared with its ground truth.
+
+    Attributes:
+        scored: Candidates and true boxes, for each image.
+        pairs: Detections that count as found, each with its true primitive.
+        detections: Number of all detections.
+        truths: Number of all true primitives.
+
     """
 
-    marked: tuple[Marked, ...]
-    pairs: tuple[tuple[Primitive, Primitive], ...]
+    scored: tuple[ScoredBoxes, ...]
+    pairs: tuple[PrimitivePair, ...]
     detections: int
     truths: int
 
     @classmethod
-    def of(cls, marked: Iterable[Marked], found: Sequence[Detection], true: Sequence[Primitive]) -> Told:
-        """Detections held against what is there."""
-        told = [one.primitive for one in found]
-        pairs = [(told[pair.detection], true[pair.truth]) for pair in match_primitives(told, true) if pair.found]
-        return cls(tuple(marked), tuple(pairs), len(told), len(true))
+    def compare(
+        cls, scored: Iterable[ScoredBoxes], detections: Sequence[Detection], truth: Sequence[Primitive]
+    ) -> SessionScore:
+        """Compare detections with the ground truth.
+
+        Args:
+            scored: Candidates and true boxes.
+            detections: Detections.
+            truth: True primitives.
+
+        Returns:
+            The comparison.
+
+        """
+        found = [detection.primitive for detection in detections]
+        return cls(tuple(scored), tuple(matched_pairs(found, truth)), len(found), len(truth))
 
 
-def trial(seed: int, options: SetOptions, mapper: str, weights: Path) -> tuple[Told, Told]:
-    """What is told of the session of a seed: by the networks alone, and refined."""
-    world, scans = recorded(session_options(options, seed))
-    x0, y0, x1, y1 = world.bounds
-    frame = GridFrame.covering((x0 - MARGIN, y0 - MARGIN, x1 + MARGIN, y1 + MARGIN), options.resolution)
+def evaluate_session(
+    seed: int, options: DatasetOptions, mapper: str, weights: Path
+) -> tuple[SessionScore, SessionScore]:
+    """Record a session, map it, detect and refine.
+
+    Args:
+        seed: Seed of the session.
+        options: How it is recorded.
+        mapper: Name of the mapper.
+        weights: Folder of the detector's weights.
+
+    Returns:
+        The score of the networks alone, and that after refinement.
+
+    """
+    world, scans = simulate_session(session_options(options, seed))
+    frame = map_frame(world, options.resolution)
     grid = map_scans(mapper, scans, options.resolution, frame.bounds)
-    detector = _loaded(weights, mapper)
+    detector = _load_detector(weights, mapper)
     detections = detector.detect(grid)
     refined, _ = refine_detections(detections, scans, grid, None, 1)
-    pictured = [
-        Pictured(Sample(Path(), tile, held_in(tile, world.primitives), 0.0), cut(grid, tile, detector.card.style))
-        for tile in tiles(frame)
+    images = [
+        LabelledImage(
+            Sample(Path(), tile, primitives_in_tile(world.primitives, tile), 0.0),
+            tile_image(grid, tile, detector.card.style),
+        )
+        for tile in tile_frames(frame)
     ]
-    candidates = mark(detector.yolo, pictured)
+    candidates = scored_candidates(detector.yolo, images)
     return (
-        Told.of(candidates, detections.found, world.primitives),
-        Told.of([marked(refined, world.primitives)], refined.found, world.primitives),
+        SessionScore.compare(candidates, detections.found, world.primitives),
+        SessionScore.compare([scored_primitives(refined, world.primitives)], refined.found, world.primitives),
     )
 
 
-def trials(seeds: Sequence[int], options: SetOptions, mapper: str, weights: Path) -> dict[str, Any]:
-    """All sessions, on all cores: what the ``networks`` alone are worth, and what is ``refined``; as it is kept.
+def evaluate_sessions(seeds: Sequence[int], options: DatasetOptions, mapper: str, weights: Path) -> dict[str, Any]:
+    """Evaluate sessions on all cores.
 
-    Each holds ``boxes`` (box_metrics.Scores) and ``errors`` (evaluate.Errors) of all kinds and of
-    each, and ``found``: precision, recall and F1.
+    Args:
+        seeds: Seeds of the sessions.
+        options: How they are recorded.
+        mapper: Name of the mapper.
+        weights: Folder of the detector's weights.
+
+    Returns:
+        Results as they are stored: ``networks`` (alone) and ``refined``, each as :func:`summarize_sessions`.
+
     """
+    evaluate = partial(evaluate_session, options=options, mapper=mapper, weights=weights)
     with ProcessPoolExecutor(cores()) as pool:
-        told = list(pool.map(partial(trial, options=options, mapper=mapper, weights=weights), seeds, chunksize=4))
-    return {name: summed_up(own) for name, own in zip(("networks", "refined"), zip(*told, strict=True), strict=True)}
+        scores = list(pool.map(evaluate, seeds, chunksize=4))
+    networks, refined = zip(*scores, strict=True)
+    return {"networks": summarize_sessions(networks), "refined": summarize_sessions(refined)}
 
 
-def summed_up(told: Sequence[Told]) -> dict[str, Any]:
-    """Scores and errors over sessions."""
-    pairs = [pair for one in told for pair in one.pairs]
-    scores = score_boxes([marked for one in told for marked in one.marked])
+def summarize_sessions(scores: Sequence[SessionScore]) -> dict[str, Any]:
+    """Compute metrics over sessions: ``boxes`` (BoxMetrics), ``errors`` (ParameterErrors), ``found``.
+
+    The first two by kind and for ``all``; ``found`` is precision, recall and F1.
+    """
+    pairs = [pair for score in scores for pair in score.pairs]
+    metrics = score_boxes([scored for score in scores for scored in score.scored])
+    detections, truths = sum(score.detections for score in scores), sum(score.truths for score in scores)
     return {
-        "boxes": {name: asdict(one) for name, one in scores.items()},
-        "errors": {name: asdict(one) for name, one in errors_of(pairs).items()},
-        "found": found_rates(len(pairs), sum(one.detections for one in told), sum(one.truths for one in told)),
+        "boxes": {name: asdict(row) for name, row in metrics.items()},
+        "errors": {name: asdict(row) for name, row in parameter_errors(pairs).items()},
+        "found": precision_recall_f1(len(pairs), detections, truths),
     }
 
 
 @lru_cache(maxsize=4)
-def _loaded(weights: Path, mapper: str) -> Detector:
+def _load_detector(weights: Path, mapper: str) -> Detector:
     return Detector.load(weights, mapper, 1)
 
 
-def marked(refined: Detections, true: Sequence[Primitive]) -> Marked:
-    """The boxes around outlines, as each kind that they may be of by its chance; beside the true ones, in cells of
-    10 mm.
+def scored_primitives(refined: Detections, truth: Sequence[Primitive]) -> ScoredBoxes:
+    """Return boxes around refined outlines as candidates of each kind, scored by that kind's posterior probability.
+
+    Args:
+        refined: Refined detections, and rejected candidates with what was fitted to them.
+        truth: True primitives.
+
+    Returns:
+        Candidates and true boxes, in cells of 10 mm.
+
     """
-    unsure = [one.fitted for one in refined.rejected if one.fitted is not None]
-    told = [
-        (box_around(one.primitive), KINDS.index(kind), share * chance)
-        for ones, share in ((refined.found, 1.0), (unsure, RIGHT_AFTER_ALL))
-        for one in ones
-        for kind, chance in (one.chances or {one.primitive.kind: one.score}).items()
-        if share * chance >= LEAST_CHANCE
+    rejected = [rejection.fitted for rejection in refined.rejected if rejection.fitted is not None]
+    candidates = [
+        (primitive_box(detection.primitive), KINDS.index(kind), weight * probability)
+        for detections, weight in ((refined.found, 1.0), (rejected, REJECTED_WEIGHT))
+        for detection in detections
+        for kind, probability in _kind_probabilities(detection).items()
+        if weight * probability >= MIN_PROBABILITY
     ]
-    boxes = np.array([box for box, _, _ in told], np.float32).reshape(-1, 4)
-    kinds = np.array([kind for _, kind, _ in told], np.intp)
-    scores = np.array([chance for _, _, chance in told], np.float32)
-    there = np.array([box_around(one) for one in true], np.float32).reshape(-1, 4)
-    return Marked(Boxes(boxes, kinds, scores), there, np.array([KINDS.index(one.kind) for one in true], np.intp))
+    boxes = np.array([box for box, _, _ in candidates], np.float32).reshape(-1, 4)
+    kinds = np.array([kind for _, kind, _ in candidates], np.intp)
+    scores = np.array([score for _, _, score in candidates], np.float32)
+    true_box = np.array([primitive_box(primitive) for primitive in truth], np.float32).reshape(-1, 4)
+    true_kind = np.array([KINDS.index(primitive.kind) for primitive in truth], np.intp)
+    return ScoredBoxes(Boxes(boxes, kinds, scores), true_box, true_kind)
 
 
-def box_around(primitive: Primitive) -> FloatArray:
-    """Left, top, right, bottom in cells of 10 mm."""
-    outline = 100 * primitive.outline()
+def _kind_probabilities(detection: Detection) -> dict[Kind, float]:
+    """Return a detection's kinds with their probabilities; its own with its score where it was not refined."""
+    return dict(detection.kind_probabilities or {detection.primitive.kind: detection.score})
+
+
+def primitive_box(primitive: Primitive) -> FloatArray:
+    """Return left, top, right, bottom of an outline in cells of 10 mm."""
+    outline = CELLS_PER_METRE * primitive.outline()
     return np.concatenate((outline.min(axis=0), outline.max(axis=0)))

@@ -1,14 +1,14 @@
-"""The suites of ``prim-eval``: the paper's experiment made again, and the shipped weights on fresh sessions.
+"""The suites of ``prim-eval``: the paper's experiment reproduced, and the shipped weights on new sessions.
 
-Everything lies in one folder and is made once: an interrupted run goes on where it stopped.
+Everything is kept in one folder and made once: an interrupted run is continued.
 
-    drawings/  start/            what training begins from, in the place of COCO's weights (detect.training.drawings)
-    train-250/  test-250/        500 maps to train on and 50 to choose thresholds on; 125 other maps (noise in mm)
+    drawings/  start/            the weights that training starts from, in place of COCO's (detect.training.drawings)
+    train-250/  test-250/        500 maps for training and 50 for thresholds; 125 other maps for tests (noise in mm)
     test-250-circle/             50 maps with one kind of primitive
     networks/prob-250/           YOLO and five CNNs by the paper's settings, as ONNX
-    results/                     one evaluation each; what is kept without its networks (docs/paper) stands
+    results/                     one file for each evaluation; those without their networks (docs/paper) are kept
 
-Noise has two readings (DESIGN: n is a share of 5 m as written, of 1 m as the paper's maps look); both are done.
+Noise n has two readings, a share of 5 m as written and of 1 m as the paper's maps suggest; both are evaluated.
 """
 
 from __future__ import annotations
@@ -20,251 +20,345 @@ from pathlib import Path
 from typing import Any
 
 from detect.detector import Detector
-from detect.evaluation.evaluate import evaluate
-from detect.evaluation.paper import ROWS, Row
-from detect.evaluation.sessions import trials
+from detect.evaluation.evaluate import evaluate_detector
+from detect.evaluation.modes import RecordingMode
+from detect.evaluation.paper import ROWS, PaperRow
+from detect.evaluation.sessions import evaluate_sessions
 from detect.networks.parameters import PAPER
-from detect.networks.weights import DETECTOR
-from detect.training.dataset import PRESETS, SetOptions, samples
-from detect.training.dataset import sessions as sessions_of
-from detect.training.recipe import Say, make_set, make_start, make_weights, timed
+from detect.networks.weights import DETECTOR_FILE
+from detect.training.dataset import DATASET_PRESETS, DatasetOptions, load_samples, session_seeds
+from detect.training.recipe import Announce, announce_duration, ensure_dataset, pretrain_yolo, train_weights
 from mapping.mapper import MAPPERS
 from prim.errors import OutputError, UsageError
 from prim.shapes import Kind
 
 READINGS = {"as the maps suggest": 1.0, "as written": 5.0}
-"""The standard deviation (m) of noise 1.0 under each reading."""
+"""Standard deviation (m) of noise n = 1 under each reading."""
 
-TRAINING = SetOptions(sizes=(500, 50), seed=100_000, rounded=PRESETS["paper"].rounded)
-TESTING = SetOptions(sizes=(0, 125), seed=150_000, rounded=PRESETS["paper"].rounded)
-SINGLE = SetOptions(sizes=(0, 50), seed=160_000, rounded=PRESETS["paper"].rounded)
-SINGLE_STEP = 1000
-"""Sets of one kind have seeds this far apart."""
-
+TRAINING = DatasetOptions(sizes=(500, 50), seed=100_000, rounded=DATASET_PRESETS["paper"].rounded)
+TESTING = DatasetOptions(sizes=(0, 125), seed=150_000, rounded=DATASET_PRESETS["paper"].rounded)
+SINGLE_KIND = DatasetOptions(sizes=(0, 50), seed=160_000, rounded=DATASET_PRESETS["paper"].rounded)
+SINGLE_KIND_STEP = 1000
+"""Distance of the seeds of two data sets of one kind."""
 
 SHIPPED_NOISE = (0, 50, 75, 100, 250, 375, 500)
+"""Range noise (mm) of warped sessions."""
+
 OTHERS_NOISE = (50, 250, 500)
+"""Range noise (mm) of the other modes of recording."""
+
+Json = dict[str, Any]
+
+PaperResult = tuple["Case", Json, dict[str, Json]]
+"""A case, its evaluation, and its evaluations on maps with one kind by the kind's name."""
 
 
 @dataclass(frozen=True)
 class Case:
-    """One row of the tables under one reading; noise as millimetres of standard deviation."""
+    """A row of the tables under one reading of noise.
+
+    Attributes:
+        reading: One of READINGS.
+        row: The row.
+        train_mm: Standard deviation (mm) of the noise of training maps.
+        test_mm: The same of test maps.
+
+    """
 
     reading: str
-    row: Row
+    row: PaperRow
     train_mm: int
     test_mm: int
 
     @property
     def network(self) -> str:
-        """The folder of its networks."""
+        """Name of the folder of its networks."""
         return f"{self.row.mapper}-{self.train_mm}"
 
     @property
-    def test(self) -> str:
-        """Its test set."""
+    def test_set(self) -> str:
+        """Name of its test set."""
         return f"test-{self.test_mm}"
 
     @property
-    def alone(self) -> tuple[Kind, ...]:
-        """The kinds it is tested on alone as well: all, where it was trained on the noise that it is tested on."""
+    def single_kinds(self) -> tuple[Kind, ...]:
+        """The kinds it is tested on alone too: all where training and test have the same noise, else none."""
         return tuple(Kind) if self.train_mm == self.test_mm else ()
+
+    def single_kind_set(self, kind: Kind) -> str:
+        """Return the name of its test set with one kind."""
+        return f"{self.test_set}-{kind}"
 
 
 def cases() -> Iterator[Case]:
-    """The paper's eight rows, and the same for the forward mapper, under both readings."""
+    """Yield the paper's eight rows, and those of det for the forward mapper, under both readings."""
     forward = [replace(row, mapper="forward") for row in ROWS if row.mapper == "det"]
     for reading, full in READINGS.items():
         for row in (*ROWS, *forward):
             yield Case(reading, row, round(1000 * full * row.train), round(1000 * full * row.test))
 
 
-def single(kind: Kind) -> str:
-    """What is added to a test set's name where it holds one kind alone."""
-    return f"-{kind}"
+class PaperSuite:
+    """The paper's experiment in a folder, which one process at a time may use.
 
+    Attributes:
+        work: The folder.
+        announce: Called with lines of progress.
 
-class Suite:
-    """The experiment in a folder; ``say`` is told what is being done. One at a time works in a folder."""
+    """
 
-    def __init__(self, work: Path, say: Say) -> None:
-        self.work, self.say = work, say
+    def __init__(self, work: Path, announce: Announce) -> None:
+        self.work, self.announce = work, announce
 
-    def measured(self) -> list[tuple[Case, dict[str, Any], dict[str, dict[str, Any]]]]:
-        """What :meth:`run` has measured so far; makes nothing. Raises UsageError where that is nothing."""
-        found = []
+    def results(self) -> list[PaperResult]:
+        """Return the results so far; nothing is made.
+
+        Raises:
+            UsageError: There are none.
+
+        """
+        found: list[PaperResult] = []
         for case in cases():
-            alone = {kind: read(self.result(case, case.test + single(kind))) for kind in case.alone}
-            whole = read(self.result(case, case.test))
+            single = {
+                kind: read_result(self.result_path(case, case.single_kind_set(kind))) for kind in case.single_kinds
+            }
+            whole = read_result(self.result_path(case, case.test_set))
             if whole is not None:
-                each = {kind.value: value for kind, value in alone.items() if value is not None}
-                found.append((case, whole, each if len(each) == len(Kind) else {}))
+                by_kind = {kind.value: value for kind, value in single.items() if value is not None}
+                found.append((case, whole, by_kind if len(by_kind) == len(Kind) else {}))
         if not found:
             raise UsageError(f"nothing has been measured in {self.work} yet")
         return found
 
-    def run(self) -> list[tuple[Case, dict[str, Any], dict[str, dict[str, Any]]]]:
-        """Makes what is missing; returns each case with its evaluation, and those on maps with one kind alone.
+    def run(self) -> list[PaperResult]:
+        """Make what is missing; return the results of all cases.
 
-        Raises PrimError where the folder cannot be used.
+        Raises:
+            PrimError: The folder cannot be used.
+
         """
-        found = []
+        found: list[PaperResult] = []
         for case in cases():
-            alone = {kind.value: self.evaluated(case, case.test + single(kind)) for kind in case.alone}
-            found.append((case, self.evaluated(case, case.test), alone))
+            single = {kind.value: self.evaluate(case, case.single_kind_set(kind)) for kind in case.single_kinds}
+            found.append((case, self.evaluate(case, case.test_set), single))
         return found
 
-    def evaluated(self, case: Case, test: str) -> dict[str, Any]:
-        """The evaluation of a case's networks on a set."""
-        path = self.result(case, test)
-        kept = read(path)
-        if kept is not None and not (self.work / "networks" / case.network).exists():
-            return kept
-        return evaluated(path, self.networks(case), case.row.mapper, lambda: self.tests(test), self.say)
+    def evaluate(self, case: Case, test_set: str) -> Json:
+        """Evaluate a case's networks, unless that is done.
 
-    def result(self, case: Case, test: str) -> Path:
-        """Where an evaluation is kept."""
-        return self.work / "results" / f"{case.network}.{test}.json"
+        Args:
+            case: The case.
+            test_set: Name of the test set.
+
+        Returns:
+            The evaluation, as JSON.
+
+        """
+        path = self.result_path(case, test_set)
+        stored = read_result(path)
+        if stored is not None and not (self.work / "networks" / case.network).exists():
+            return stored
+        networks = self.networks(case)
+        return evaluate_networks(path, networks, case.row.mapper, lambda: self.test_set(test_set), self.announce)
+
+    def result_path(self, case: Case, test_set: str) -> Path:
+        """Return the file of an evaluation.
+
+        Args:
+            case: The case.
+            test_set: Name of the test set.
+
+        Returns:
+            Its path.
+
+        """
+        return self.work / "results" / f"{case.network}.{test_set}.json"
 
     def networks(self, case: Case) -> Path:
-        """The folder of a case's networks, trained."""
+        """Return the folder of a case's networks; train them where they are missing."""
         folder = self.work / "networks" / case.network
-        if (folder / DETECTOR).exists():
+        if (folder / DETECTOR_FILE).exists():
             return folder
         about = {"maps": TRAINING.sizes[0], "seed": TRAINING.seed, "noise_std_m": case.train_mm / 1000}
-        data, start = self.training(case.train_mm), make_start(self.work, self.say)
-        return make_weights(data, case.row.mapper, folder, PAPER.name, start, self.say, about)
+        data, start = self.training_set(case.train_mm), pretrain_yolo(self.work, self.announce)
+        return train_weights(data, case.row.mapper, folder, PAPER.name, start, self.announce, about)
 
-    def training(self, noise_mm: int) -> Path:
-        """A set to train on."""
-        return self._made(f"train-{noise_mm}", replace(TRAINING, noise_stds=(noise_mm / 1000,)))
+    def training_set(self, noise_mm: int) -> Path:
+        """Return the folder of the training set of a noise (mm); make it where it is missing."""
+        return self._dataset(f"train-{noise_mm}", replace(TRAINING, noise_stds=(noise_mm / 1000,)))
 
-    def tests(self, name: str) -> Path:
-        """A set to test on, by its name."""
+    def test_set(self, name: str) -> Path:
+        """Return the folder of a test set by its name, ``test-NOISE[-KIND]``; make it where it is missing."""
         _, noise_mm, *kind = name.split("-")
         options = TESTING
         if kind:
-            seed = SINGLE.seed + SINGLE_STEP * list(Kind).index(Kind(kind[0]))
-            options = replace(SINGLE, kinds=(kind[0],), seed=seed)
-        return self._made(name, replace(options, noise_stds=(int(noise_mm) / 1000,)))
+            seed = SINGLE_KIND.seed + SINGLE_KIND_STEP * list(Kind).index(Kind(kind[0]))
+            options = replace(SINGLE_KIND, kinds=(kind[0],), seed=seed)
+        return self._dataset(name, replace(options, noise_stds=(int(noise_mm) / 1000,)))
 
-    def _made(self, name: str, options: SetOptions) -> Path:
-        return make_set(self.work / name, options, self.say)
+    def _dataset(self, name: str, options: DatasetOptions) -> Path:
+        return ensure_dataset(self.work / name, options, self.announce)
 
 
 @dataclass(frozen=True)
-class Condition:
-    """How the sessions of one row of the shipped weights' table are recorded."""
+class RecordingCondition:
+    """Conditions under which the sessions of one row of the shipped weights' table are recorded.
+
+    Attributes:
+        name: One of RecordingMode.
+        noise_mm: Standard deviation of the range noise (mm).
+        options: How sessions are recorded.
+
+    """
 
     name: str
     noise_mm: int
-    options: SetOptions
+    options: DatasetOptions
 
     @property
-    def set(self) -> str:
-        """Its folder."""
+    def slug(self) -> str:
+        """Its name in file names."""
         return f"{self.name.replace(' ', '-')}-{self.noise_mm}"
 
 
-WAYS = ("warped", "driven", "no walls", "180 rays", "1000 rays")
-"""The ways of recording."""
-
-
-def conditions(sessions: int) -> Iterator[Condition]:
-    """All noise levels on warped sessions, and other ways of recording at three of them."""
-    plain = SetOptions(sizes=(0, sessions), seed=300_000)
+def conditions(sessions: int) -> Iterator[RecordingCondition]:
+    """Yield all noise levels of warped sessions, and three of the other modes; ``sessions`` each."""
+    plain = DatasetOptions(sizes=(0, sessions), seed=300_000)
     for noise_mm in SHIPPED_NOISE:
-        yield Condition(WAYS[0], noise_mm, replace(plain, noise_stds=(noise_mm / 1000,)))
-    changes: tuple[dict[str, Any], ...] = (
-        {"motions": ("drive",)},
-        {"walled": 0.0},
-        {"rays": (180,)},
-        {"rays": (1000,)},
-    )
-    for name, change in zip(WAYS[1:], changes, strict=True):
+        yield RecordingCondition(RecordingMode.WARPED, noise_mm, replace(plain, noise_stds=(noise_mm / 1000,)))
+    variations: dict[RecordingMode, Json] = {
+        RecordingMode.DRIVEN: {"motions": ("drive",)},
+        RecordingMode.NO_WALLS: {"walled": 0.0},
+        RecordingMode.FEW_RAYS: {"rays": (180,)},
+        RecordingMode.MANY_RAYS: {"rays": (1000,)},
+    }
+    for name, change in variations.items():
         for noise_mm in OTHERS_NOISE:
-            yield Condition(name, noise_mm, replace(plain, noise_stds=(noise_mm / 1000,), **change))
+            options = replace(plain, noise_stds=(noise_mm / 1000,), **change)
+            yield RecordingCondition(name, noise_mm, options)
 
 
-Measured = tuple[Condition, str, int, dict[str, Any]]
-"""A condition, a mapper, how many sessions were measured, and what detect.evaluation.sessions says of them."""
+ShippedResult = tuple[RecordingCondition, str, int, Json]
+"""A condition, a mapper, the number of sessions, and the results of detect.evaluation.sessions."""
 
 
 class ShippedSuite:
-    """The weights of a folder, one inside it for each mapper, on fresh sessions; ``say`` is told what is done."""
+    """Weights of all mappers on new sessions.
 
-    def __init__(self, work: Path, weights: Path, say: Say) -> None:
-        self.work, self.weights, self.say = work, weights, say
+    Attributes:
+        work: The folder of the results.
+        weights: The weights, one folder for each mapper.
+        announce: Called with lines of progress.
 
-    def run(self, sessions: int, mappers: Sequence[str] = MAPPERS, ways: Sequence[str] = ()) -> list[Measured]:
-        """Measures what is missing of so many sessions for each of the ``mappers`` and each of the ``ways`` of
-        recording (all, where none is named); returns all that has been measured.
+    """
 
-        Raises UsageError where the folder holds no weights, OutputError where a result cannot be written.
+    def __init__(self, work: Path, weights: Path, announce: Announce) -> None:
+        self.work, self.weights, self.announce = work, weights, announce
+
+    def run(self, sessions: int, mappers: Sequence[str] = MAPPERS, modes: Sequence[str] = ()) -> list[ShippedResult]:
+        """Evaluate what is missing.
+
+        Args:
+            sessions: Number of sessions of each condition.
+            mappers: Names of the mappers.
+            modes: Modes of recording (RecordingMode); all where none is named.
+
+        Returns:
+            All results so far.
+
+        Raises:
+            UsageError: The folder holds no weights.
+            OutputError: A result cannot be written.
+
         """
-        able = [mapper for mapper in mappers if (self.weights / mapper / DETECTOR).exists()]
-        if not able:
+        available = [mapper for mapper in mappers if (self.weights / mapper / DETECTOR_FILE).exists()]
+        if not available:
             raise UsageError(f"{self.weights} holds no weights: a folder for each mapper is wanted")
-        for mapper in able:
+        for mapper in available:
             for condition in conditions(sessions):
-                if not ways or condition.name in ways:
-                    self._measure(condition, sessions, mapper)
-        return self.measured()
+                if not modes or condition.name in modes:
+                    self._evaluate(condition, sessions, mapper)
+        return self.results()
 
-    def _measure(self, condition: Condition, sessions: int, mapper: str) -> None:
-        """Measures one row, unless it was measured with these weights before."""
-        path, weights = self._result(condition, sessions, mapper), self.weights / mapper
-        if path.exists() and path.stat().st_mtime >= (weights / DETECTOR).stat().st_mtime:
+    def _evaluate(self, condition: RecordingCondition, sessions: int, mapper: str) -> None:
+        """Evaluate one condition, unless that was done with these weights."""
+        path, weights = self._result_path(condition, sessions, mapper), self.weights / mapper
+        if path.exists() and path.stat().st_mtime >= (weights / DETECTOR_FILE).stat().st_mtime:
             return
-        with timed(path.stem, self.say):
-            seeds = [seed for _, seed in sessions_of(condition.options)]
-            found = trials(seeds, condition.options, mapper, weights)
+        with announce_duration(path.stem, self.announce):
+            seeds = [seed for _, seed in session_seeds(condition.options)]
+            result = evaluate_sessions(seeds, condition.options, mapper, weights)
         path.parent.mkdir(parents=True, exist_ok=True)
-        write(path, json.dumps(found, indent=1))
+        write_text(path, json.dumps(result, indent=1))
 
-    def measured(self) -> list[Measured]:
-        """What has been measured so far, of each row with most sessions. Raises UsageError where that is nothing."""
+    def results(self) -> list[ShippedResult]:
+        """Return the results so far, of each condition and mapper those with most sessions.
+
+        Raises:
+            UsageError: There are none.
+
+        """
         found = []
         for condition in conditions(1):
             for mapper in MAPPERS:
-                paths = (self.work / "results").glob(f"{condition.set}.*.{mapper}.json")
+                paths = (self.work / "results").glob(f"{condition.slug}.*.{mapper}.json")
                 counts = [int(path.name.split(".")[1]) for path in paths]
                 if counts:
-                    value = read(self._result(condition, max(counts), mapper))
+                    value = read_result(self._result_path(condition, max(counts), mapper))
                     assert value is not None
                     found.append((condition, mapper, max(counts), value))
         if not found:
             raise UsageError(f"nothing has been measured in {self.work} yet")
         return found
 
-    def _result(self, condition: Condition, sessions: int, mapper: str) -> Path:
-        """Where a row is kept."""
-        return self.work / "results" / f"{condition.set}.{sessions}.{mapper}.json"
+    def _result_path(self, condition: RecordingCondition, sessions: int, mapper: str) -> Path:
+        return self.work / "results" / f"{condition.slug}.{sessions}.{mapper}.json"
 
 
-def evaluated(path: Path, networks: Path, mapper: str, data: Callable[[], Path], say: Say) -> dict[str, Any]:
-    """The evaluation of networks on a set, kept at ``path``; made again where the networks are newer."""
-    if not path.exists() or path.stat().st_mtime < (networks / DETECTOR).stat().st_mtime:
+def evaluate_networks(path: Path, networks: Path, mapper: str, data: Callable[[], Path], announce: Announce) -> Json:
+    """Evaluate networks on a data set, unless their result is stored and newer than they are.
+
+    Args:
+        path: File of the result.
+        networks: Folder of the networks.
+        mapper: Name of the mapper.
+        data: Returns the folder of the data set, called where it is needed.
+        announce: Called with lines of progress.
+
+    Returns:
+        The evaluation, as JSON.
+
+    """
+    if not path.exists() or path.stat().st_mtime < (networks / DETECTOR_FILE).stat().st_mtime:
         detector = Detector.load(networks, mapper)
-        chosen = samples(data(), mapper, "val")
-        say(f"evaluating {path.stem}")
+        samples = load_samples(data(), mapper, "val")
+        announce(f"evaluating {path.stem}")
         path.parent.mkdir(parents=True, exist_ok=True)
-        write(path, json.dumps(evaluate(detector, chosen).to_json(), indent=1))
-    value = read(path)
+        write_text(path, json.dumps(evaluate_detector(detector, samples).to_json(), indent=1))
+    value = read_result(path)
     assert value is not None
     return value
 
 
-def read(path: Path) -> dict[str, Any] | None:
-    """An evaluation that is kept; None where there is none."""
+def read_result(path: Path) -> Json | None:
+    """Read a stored evaluation; None where there is none."""
     if not path.exists():
         return None
-    value: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
+    value: Json = json.loads(path.read_text(encoding="utf-8"))
     return value
 
 
-def write(path: Path, text: str) -> None:
-    """Writes a file; whole, or not at all. Raises OutputError where it cannot."""
+def write_text(path: Path, text: str) -> None:
+    """Write a text file atomically.
+
+    Args:
+        path: The file.
+        text: Its content.
+
+    Raises:
+        OutputError: It cannot be written.
+
+    """
     part = path.with_name(path.name + ".part")
     try:
         part.write_text(text, encoding="utf-8")

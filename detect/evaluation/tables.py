@@ -1,4 +1,4 @@
-"""The paper's tables, measured again, as Markdown, CSV and plots."""
+"""Reports of the suites as Markdown, CSV and plots: the paper's tables reproduced, and the shipped weights'."""
 
 from __future__ import annotations
 
@@ -9,33 +9,30 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
-from detect.evaluation.paper import ROWS, SHAPES, TABLE_1, TABLE_2, TESTED, Row
-from detect.evaluation.suites import READINGS, Case, Measured, cases, write
+from detect.evaluation.paper import ROWS, SHAPES, TABLE_1, TABLE_2, TEST_IMAGES, PaperRow
+from detect.evaluation.suites import READINGS, Case, PaperResult, ShippedResult, cases, write_text
 
-Result = tuple[Case, dict[str, Any], dict[str, dict[str, Any]]]
-"""A case, its evaluation, and its evaluations on maps with one kind alone."""
+BOX_METRICS = {"f1": "F1", "map50": "mAP 0.5", "map50_95": "mAP 0.5–0.95", "auc": "AUC"}
+"""Columns of Table I: the fields of BoxMetrics and their titles."""
 
-BOXES = {"f1": "F1", "map50": "mAP 0.5", "map50_95": "mAP 0.5–0.95", "auc": "AUC"}
-"""Table I's measures."""
+ERROR_METRICS = {"angle": "angle (°)", "width": "width (mm)", "height": "height (mm)"}
+"""Columns of Table II: the fields of ParameterErrors and their titles."""
 
-ERRORS = {"angle": "angle (°)", "width": "width (mm)", "height": "height (mm)"}
-"""Table II's measures."""
-
-MORE = ("median_angle", "clear_angle", "size")
-"""What Table II does not have."""
+FURTHER_ERRORS = ("median_angle", "clear_angle", "size")
+"""Fields of ParameterErrors that Table II does not have."""
 
 UNITS = dict.fromkeys(("angle", "median_angle", "clear_angle"), math.degrees(1)) | dict.fromkeys(
     ("width", "height", "position"), 1e3
 )
+"""Factors from radians to degrees and from metres to millimetres."""
 
 COLUMNS = (
     "reading", "mapper", "train_n", "test_n", "train_std_m", "test_std_m", "shape",
-    *BOXES, "yolo_ms", *(f"true_box_{name}" for name in (*ERRORS, *MORE)), "parameters_ms",
-    *(f"detected_{name}" for name in (*ERRORS, *MORE, "position")),
-    *(f"paper_{name}" for name in (*BOXES, "yolo_ms", *ERRORS, "parameters_ms")),
+    *BOX_METRICS, "yolo_ms", *(f"true_box_{name}" for name in (*ERROR_METRICS, *FURTHER_ERRORS)), "parameters_ms",
+    *(f"detected_{name}" for name in (*ERROR_METRICS, *FURTHER_ERRORS, "position")),
+    *(f"paper_{name}" for name in (*BOX_METRICS, "yolo_ms", *ERROR_METRICS, "parameters_ms")),
 )  # fmt: skip
-"""The CSV's: angles in degrees, lengths in millimetres, sizes as shares."""
-
+"""Columns of paper.csv: angles in degrees, lengths in millimetres, sizes as shares."""
 
 INTRODUCTION = f"""\
 # The paper's tables, measured again
@@ -48,65 +45,78 @@ and prob are rounded to occupied, free and unknown, as the paper's; those of for
 the largest over all confidences at box IoU 0.5; AUC is the area under precision and recall there; «all» is the mean
 over the shapes. Errors are means over true boxes, angles modulo each shape's symmetry; «clear» are angles of shapes
 whose sides differ by a tenth or more; widths and heights of «all» leave out circles, as the paper's means do. Times
-are per image, one at a time (the paper's divided by its {TESTED} images)."""
+are per image, one at a time (the paper's divided by its {TEST_IMAGES} images)."""
 
 ABSTRACT = """
 The paper's abstract: 95 % of the shapes classified right at low noise, 85 % at high; sizes wrong by 5 to 12 %."""
 
 
-def report(results: Sequence[Result], folder: Path) -> list[Path]:
-    """Writes paper.md, paper.csv and paper.png; returns their paths. Raises OutputError where it cannot."""
+def write_paper_report(results: Sequence[PaperResult], folder: Path) -> list[Path]:
+    """Write paper.md, paper.csv and paper.png.
+
+    Args:
+        results: Results of the paper's suite.
+        folder: Where they go.
+
+    Returns:
+        Their paths.
+
+    Raises:
+        OutputError: A file cannot be written.
+
+    """
     markdown, table, plot = (folder / f"paper.{ending}" for ending in ("md", "csv", "png"))
     folder.mkdir(parents=True, exist_ok=True)
-    write(markdown, "\n".join(_markdown(results)) + "\n")
-    write(table, _csv(results))
+    write_text(markdown, "\n".join(_markdown(results)) + "\n")
+    write_text(table, _csv(results))
     _plot(results, plot)
     return [markdown, table, plot]
 
 
-def _name(row: Row) -> str:
+def _row_title(row: PaperRow) -> str:
     return f"{row.mapper}, trained n = {row.train:g}, tested n = {row.test:g}"
 
 
-def _paper(row: Row, shape: str) -> tuple[dict[str, float | None], dict[str, float | None]]:
-    """The paper's own lines of both tables, times in ms an image; empty where it has none.
+def _paper_values(row: PaperRow, shape: str) -> tuple[dict[str, float | None], dict[str, float | None]]:
+    """Return the paper's values in both tables, times in ms for one image; empty where it has none.
 
-    A shape's time is its share of the whole, and means nothing here: it is left out.
+    The times of single shapes are shares of the whole and are left out.
     """
     if row not in ROWS:
         return {}, {}
     first, second = TABLE_1[row][SHAPES.index(shape)], TABLE_2[row][SHAPES.index(shape)]
     boxes: dict[str, float | None] = dict(
-        zip((*BOXES, "yolo_ms"), (*first[:4], first[4] / TESTED * 1e3), strict=True)
+        zip((*BOX_METRICS, "yolo_ms"), (*first[:4], first[4] / TEST_IMAGES * 1e3), strict=True)
     )
     time = second[3]
     assert time is not None
-    errors = dict(zip((*ERRORS, "parameters_ms"), (*second[:3], time / TESTED * 1e3), strict=True))
+    errors = dict(zip((*ERROR_METRICS, "parameters_ms"), (*second[:3], time / TEST_IMAGES * 1e3), strict=True))
     if shape != "all":
         del boxes["yolo_ms"], errors["parameters_ms"]
     return boxes, errors
 
 
-def _shown(ours: float | None, paper: float | None, digits: int) -> str:
-    """Ours, and the paper's in brackets."""
+def _cell(ours: float | None, paper: float | None, digits: int) -> str:
+    """Return our value, with the paper's in brackets where there is one."""
     text = "–" if ours is None else f"{ours:.{digits}f}"
     return text if paper is None else f"{text} ({paper:.{digits}f})"
 
 
 def _in_units(errors: dict[str, Any] | None, name: str) -> float | None:
+    """Return an error in the unit of the tables; None where there is none."""
     value = None if errors is None else errors[name]
     return None if value is None else float(value) * UNITS.get(name, 1.0)
 
 
-def _markdown(results: Sequence[Result]) -> Iterator[str]:
-    """The report: what was done, the lines for all shapes, then each shape's."""
-    yield from _introduction()
+def _markdown(results: Sequence[PaperResult]) -> Iterator[str]:
+    """Yield the lines of paper.md: introduction, rows over all shapes, rows of each shape."""
+    yield INTRODUCTION
     missing = len(list(cases())) - len(results)
     if missing:
         yield f"\n**{missing} of {missing + len(results)} rows are not measured yet, and are left out.**"
     for reading in dict.fromkeys(case.reading for case, _, _ in results):
         own = [result for result in results if result[0].reading == reading]
-        yield f"\n## Noise {reading}: n = 0.05 is {_std(own)} mm\n"
+        yield f"\n## Noise {reading}: n = 0.05 is {_noise_mm(own)} mm\n"
         yield from _boxes_table(own, ("all",))
         yield ""
         yield from _errors_table(own, ("all",))
@@ -116,49 +126,45 @@ def _markdown(results: Sequence[Result]) -> Iterator[str]:
         yield from _boxes_table(own, SHAPES[1:])
         yield ""
         yield from _errors_table(own, SHAPES[1:])
-        if any(alone for _, _, alone in own):
+        if any(single for _, _, single in own):
             yield f"\n### Maps with one shape alone ({reading})\n"
-            yield from _alone_table(own)
+            yield from _single_kind_table(own)
 
 
-def _std(results: Sequence[Result]) -> int:
-    """The standard deviation (mm) of n = 0.05 under a reading."""
+def _noise_mm(results: Sequence[PaperResult]) -> int:
+    """Return the standard deviation (mm) of n = 0.05 under the results' reading."""
     return round(50 * READINGS[results[0][0].reading])
 
 
-def _introduction() -> Iterator[str]:
-    yield INTRODUCTION
-
-
-def _boxes_table(results: Sequence[Result], shapes: Sequence[str]) -> Iterator[str]:
-    """Table I."""
-    yield f"| Table I | shape | {' | '.join(BOXES.values())} | ms |"
-    yield "|---|---|" + "---:|" * (len(BOXES) + 1)
+def _boxes_table(results: Sequence[PaperResult], shapes: Sequence[str]) -> Iterator[str]:
+    """Yield Table I."""
+    yield f"| Table I | shape | {' | '.join(BOX_METRICS.values())} | ms |"
+    yield "|---|---|" + "---:|" * (len(BOX_METRICS) + 1)
     for case, found, _ in results:
         for shape in shapes:
-            paper, _ = _paper(case.row, shape)
+            paper, _ = _paper_values(case.row, shape)
             ours = found["boxes"].get(shape, {})
-            cells = [_shown(ours.get(name), paper.get(name), 3) for name in BOXES]
-            time = _shown(found["yolo_time"] * 1e3, paper.get("yolo_ms"), 1) if shape == "all" else ""
-            yield f"| {_name(case.row)} | {shape} | {' | '.join(cells)} | {time} |"
+            cells = [_cell(ours.get(name), paper.get(name), 3) for name in BOX_METRICS]
+            time = _cell(found["yolo_time"] * 1e3, paper.get("yolo_ms"), 1) if shape == "all" else ""
+            yield f"| {_row_title(case.row)} | {shape} | {' | '.join(cells)} | {time} |"
 
 
-def _errors_table(results: Sequence[Result], shapes: Sequence[str]) -> Iterator[str]:
-    """Table II, at true boxes."""
-    yield f"| Table II | shape | {' | '.join(ERRORS.values())} | median angle (°) | clear angle (°) | ms |"
-    yield "|---|---|" + "---:|" * (len(ERRORS) + 3)
+def _errors_table(results: Sequence[PaperResult], shapes: Sequence[str]) -> Iterator[str]:
+    """Yield Table II, of parameters estimated at true boxes."""
+    yield f"| Table II | shape | {' | '.join(ERROR_METRICS.values())} | median angle (°) | clear angle (°) | ms |"
+    yield "|---|---|" + "---:|" * (len(ERROR_METRICS) + 3)
     for case, found, _ in results:
         for shape in shapes:
-            _, paper = _paper(case.row, shape)
+            _, paper = _paper_values(case.row, shape)
             ours = found["true_boxes"].get(shape)
-            cells = [_shown(_in_units(ours, name), paper.get(name), 1) for name in ERRORS]
-            cells += [_shown(_in_units(ours, name), None, 1) for name in ("median_angle", "clear_angle")]
-            time = _shown(found["parameters_time"] * 1e3, paper.get("parameters_ms"), 1) if shape == "all" else ""
-            yield f"| {_name(case.row)} | {shape} | {' | '.join(cells)} | {time} |"
+            cells = [_cell(_in_units(ours, name), paper.get(name), 1) for name in ERROR_METRICS]
+            cells += [_cell(_in_units(ours, name), None, 1) for name in ("median_angle", "clear_angle")]
+            time = _cell(found["parameters_time"] * 1e3, paper.get("parameters_ms"), 1) if shape == "all" else ""
+            yield f"| {_row_title(case.row)} | {shape} | {' | '.join(cells)} | {time} |"
 
 
-def _pipeline_table(results: Sequence[Result]) -> Iterator[str]:
-    """The whole pipeline, and the abstract's claims."""
+def _pipeline_table(results: Sequence[PaperResult]) -> Iterator[str]:
+    """Yield the results of the whole pipeline, with the claims of the paper's abstract."""
     yield "| whole pipeline | F1 (kind right, outline IoU 0.5) | kind right, of the boxes found | size error |" + (
         " angle (°) | width (mm) | height (mm) | position (mm) | ms |"
     )
@@ -167,35 +173,35 @@ def _pipeline_table(results: Sequence[Result]) -> Iterator[str]:
         ours = found["detected"].get("all")
         size = "–" if ours is None else f"{100 * ours['size']:.0f} %"
         kind = "–" if found["kind_accuracy"] is None else f"{100 * found['kind_accuracy']:.0f} %"
-        cells = [_shown(_in_units(ours, name), None, 1) for name in (*ERRORS, "position")]
+        cells = [_cell(_in_units(ours, name), None, 1) for name in (*ERROR_METRICS, "position")]
         time = f"{found['whole_time'] * 1e3:.1f}"
-        yield f"| {_name(case.row)} | {found['found'][2]:.3f} | {kind} | {size} | {' | '.join(cells)} | {time} |"
+        yield f"| {_row_title(case.row)} | {found['found'][2]:.3f} | {kind} | {size} | {' | '.join(cells)} | {time} |"
     yield ABSTRACT
 
 
-def _alone_table(results: Sequence[Result]) -> Iterator[str]:
-    """F1 and mAP on maps that hold one shape alone."""
+def _single_kind_table(results: Sequence[PaperResult]) -> Iterator[str]:
+    """Yield F1 and mAP on maps with one shape."""
     yield f"| F1 / mAP 0.5 | {' | '.join(SHAPES[1:])} |"
     yield "|---|" + "---:|" * len(SHAPES[1:])
-    for case, _, alone in results:
-        if alone:
-            scores = [alone[shape]["boxes"][shape] for shape in SHAPES[1:]]
-            cells = [f"{one['f1']:.3f} / {one['map50']:.3f}" for one in scores]
-            yield f"| {_name(case.row)} | {' | '.join(cells)} |"
+    for case, _, single in results:
+        if single:
+            scores = [single[shape]["boxes"][shape] for shape in SHAPES[1:]]
+            cells = [f"{row['f1']:.3f} / {row['map50']:.3f}" for row in scores]
+            yield f"| {_row_title(case.row)} | {' | '.join(cells)} |"
 
 
-def _csv(results: Sequence[Result]) -> str:
+def _csv(results: Sequence[PaperResult]) -> str:
     text = io.StringIO()
     writer = csv.DictWriter(text, COLUMNS, lineterminator="\n", extrasaction="raise")
     writer.writeheader()
     for case, found, _ in results:
         for shape in SHAPES:
-            writer.writerow(_line(case, found, shape))
+            writer.writerow(_csv_row(case, found, shape))
     return text.getvalue()
 
 
-def _line(case: Case, found: dict[str, Any], shape: str) -> dict[str, object]:
-    """A line of the CSV; what there is not is left out."""
+def _csv_row(case: Case, found: dict[str, Any], shape: str) -> dict[str, object]:
+    """Return a row of paper.csv; missing values are left out."""
     true, detected = found["true_boxes"].get(shape), found["detected"].get(shape)
     line: dict[str, object] = {
         "reading": case.reading, "mapper": case.row.mapper, "train_n": case.row.train, "test_n": case.row.test,
@@ -203,18 +209,18 @@ def _line(case: Case, found: dict[str, Any], shape: str) -> dict[str, object]:
     }  # fmt: skip
     if shape == "all":
         line |= {"yolo_ms": found["yolo_time"] * 1e3, "parameters_ms": found["parameters_time"] * 1e3}
-    line |= {name: found["boxes"].get(shape, {}).get(name) for name in BOXES}
-    line |= {f"true_box_{name}": _in_units(true, name) for name in (*ERRORS, *MORE)}
-    line |= {f"detected_{name}": _in_units(detected, name) for name in (*ERRORS, *MORE, "position")}
-    for paper in _paper(case.row, shape):
+    line |= {name: found["boxes"].get(shape, {}).get(name) for name in BOX_METRICS}
+    line |= {f"true_box_{name}": _in_units(true, name) for name in (*ERROR_METRICS, *FURTHER_ERRORS)}
+    line |= {f"detected_{name}": _in_units(detected, name) for name in (*ERROR_METRICS, *FURTHER_ERRORS, "position")}
+    for paper in _paper_values(case.row, shape):
         line |= {
             f"paper_{name}": value for name, value in paper.items() if shape == "all" or not name.endswith("_ms")
         }
     return {name: f"{value:.5g}" if isinstance(value, float) else value for name, value in line.items()}
 
 
-def _plot(results: Sequence[Result], path: Path) -> None:
-    """MAP 0.5 and F1 over the tested noise, for each mapper and reading, with the paper's points."""
+def _plot(results: Sequence[PaperResult], path: Path) -> None:
+    """Plot mAP 0.5 and F1 over the noise of the tests, for each mapper and reading, with the paper's values."""
     from matplotlib.figure import Figure
 
     readings = list(dict.fromkeys(case.reading for case, _, _ in results))
@@ -231,10 +237,10 @@ def _plot(results: Sequence[Result], path: Path) -> None:
                     continue
                 at = [case.row.test for case, _ in own]
                 axis.plot(at, [f["boxes"]["all"][name] for _, f in own], "o-", color=colour, label=mapper)
-                paper = [_paper(case.row, "all")[0].get(name) for case, _ in own]
+                paper = [_paper_values(case.row, "all")[0].get(name) for case, _ in own]
                 if paper and None not in paper:
                     axis.plot(at, paper, "x:", color=colour, label=f"{mapper}, the paper's")
-            axis.set(xlabel="noise n tested", ylabel=f"{BOXES[name]}, all shapes", ylim=(0, 1))
+            axis.set(xlabel="noise n tested", ylabel=f"{BOX_METRICS[name]}, all shapes", ylim=(0, 1))
             axis.set_title(f"trained n = 0.05, noise {reading}", fontsize=10)
             axis.grid(alpha=0.3)
             if axis.get_legend_handles_labels()[0]:
@@ -242,16 +248,16 @@ def _plot(results: Sequence[Result], path: Path) -> None:
     figure.savefig(path, dpi=110)
 
 
-SHIPPED = """\
+SHIPPED_INTRODUCTION = """\
 # The shipped weights, measured
 
-Made by `prim-eval --suite shipped`; seeds and ways of recording stand in `detect/evaluation/suites.py`: no
-network was trained or chosen on these sessions. F1, mAP 0.5 and mAP 0.5–0.95 are of boxes, as in the paper's
-tables: first of the networks alone (F1: the largest over all confidences), then of what a replay tells, refined
-by the log's rays. There each primitive counts as every kind with the chance of that kind, what was fitted but
-is not told with a tenth of it (of networks alone, too, mAP counts what scores below the thresholds), and F1 is
-of what is told (kind right, outlines overlap by half). Errors are means over what is told and right, of angles
-the median."""
+Made by `prim-eval --suite shipped`; seeds and modes of recording are those of `detect/evaluation/suites.py`: no
+network was trained or selected on these sessions. F1, mAP 0.5 and mAP 0.5–0.95 are of boxes, as in the paper's
+tables: first of the networks alone (F1: the largest over all score thresholds), then of a replay's primitives,
+refined by the log's rays. There each primitive counts as every kind with that kind's posterior probability, and one
+that was fitted and rejected with a tenth of it (of the networks alone, too, mAP counts candidates below the
+thresholds); F1 is of the reported primitives (kind right, polygon IoU at least 0.5). Errors are means over the
+reported primitives that are right, of angles medians."""
 
 SHIPPED_COLUMNS = (
     "networks_f1", "networks_map50", "networks_map50_95", "f1", "map50", "map50_95", "position_mm", "width_mm",
@@ -259,33 +265,45 @@ SHIPPED_COLUMNS = (
 )  # fmt: skip
 
 
-def report_shipped(results: Sequence[Measured], folder: Path) -> list[Path]:
-    """Writes shipped.md and shipped.csv; returns their paths. Raises OutputError where it cannot."""
+def write_shipped_report(results: Sequence[ShippedResult], folder: Path) -> list[Path]:
+    """Write shipped.md and shipped.csv.
+
+    Args:
+        results: Results of the shipped weights' suite.
+        folder: Where they go.
+
+    Returns:
+        Their paths.
+
+    Raises:
+        OutputError: A file cannot be written.
+
+    """
     folder.mkdir(parents=True, exist_ok=True)
     markdown, table = folder / "shipped.md", folder / "shipped.csv"
     boxes = ("F1", "mAP 0.5", "0.5–0.95")
     names = [f"networks: {boxes[0]}", *boxes[1:], f"**refined**: {boxes[0]}", *boxes[1:]]
     names += ["place (mm)", "width (mm)", "height (mm)", "angle (°)"]
-    lines = [SHIPPED, "", f"| recorded | noise (mm) | mapper | sessions | {' | '.join(names)} |"]
+    lines = [SHIPPED_INTRODUCTION, "", f"| recorded | noise (mm) | mapper | sessions | {' | '.join(names)} |"]
     lines.append("|---|---:|---|" + "---:|" * (1 + len(names)))
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(("recorded", "noise_std_m", "mapper", "sessions", *SHIPPED_COLUMNS))
-    for condition, mapper, sessions, found in results:
-        values = _shipped_values(found)
-        cells = [_shown(value, None, 3 if k < 6 else 2) for k, value in enumerate(values)]
+    for condition, mapper, sessions, result in results:
+        values = _shipped_values(result)
+        cells = [_cell(value, None, 3 if k < 6 else 2) for k, value in enumerate(values)]
         lines.append(f"| {condition.name} | {condition.noise_mm} | {mapper} | {sessions} | {' | '.join(cells)} |")
-        told = ("" if value is None else f"{value:.5g}" for value in values)
-        writer.writerow((condition.name, condition.noise_mm / 1000, mapper, sessions, *told))
-    write(markdown, "\n".join(lines) + "\n")
-    write(table, text.getvalue())
+        texts = ("" if value is None else f"{value:.5g}" for value in values)
+        writer.writerow((condition.name, condition.noise_mm / 1000, mapper, sessions, *texts))
+    write_text(markdown, "\n".join(lines) + "\n")
+    write_text(table, text.getvalue())
     return [markdown, table]
 
 
-def _shipped_values(found: dict[str, Any]) -> list[float | None]:
-    """One row, in the order of SHIPPED_COLUMNS."""
-    alone, refined = (found[name]["boxes"].get("all", {}) for name in ("networks", "refined"))
-    errors = found["refined"]["errors"].get("all")
-    told = [_in_units(errors, name) for name in ("position", "width", "height", "median_angle")]
-    networks = [alone.get(name) for name in ("f1", "map50", "map50_95")]
-    return [*networks, found["refined"]["found"][2], refined.get("map50"), refined.get("map50_95"), *told]
+def _shipped_values(result: dict[str, Any]) -> list[float | None]:
+    """Return the values of one row, in the order of SHIPPED_COLUMNS."""
+    networks, refined = (result[name]["boxes"].get("all", {}) for name in ("networks", "refined"))
+    errors = result["refined"]["errors"].get("all")
+    mean_errors = [_in_units(errors, name) for name in ("position", "width", "height", "median_angle")]
+    alone = [networks.get(name) for name in ("f1", "map50", "map50_95")]
+    return [*alone, result["refined"]["found"][2], refined.get("map50"), refined.get("map50_95"), *mean_errors]

@@ -1,1 +1,1 @@
-"""Images to boxes, kinds and first guesses of parameters, on ONNX Runtime."""
+"""Networks on ONNX Runtime: tiles, YOLO, parameter networks, weights."""

@@ -1,4 +1,4 @@
-"""The networks that read parameters, on ONNX Runtime: boxes with kinds to primitives."""
+"""The parameter networks on ONNX Runtime: from boxes with kinds to primitives."""
 
 from __future__ import annotations
 
@@ -8,15 +8,23 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from detect.networks.parameters import PRESETS, Box, Preset, crop, read_outputs
+from detect.networks.parameters import PRESETS, Box, Preset, crop_box, decode_parameters
 from detect.networks.weights import Weights, WeightsError
 from mapping.grid import GridFrame
 from prim.shapes import Kind, Primitive
 
 
 @dataclass(frozen=True)
-class Found:
-    """A box of a tile with its kind; ``grey`` is the tile's image (TILE, TILE)."""
+class BoxedKind:
+    """A box of a tile and the kind of what it bounds.
+
+    Attributes:
+        grey: Grey image (TILE_SIZE, TILE_SIZE) of the tile.
+        tile: The tile's frame.
+        box: The box, in cells of the tile.
+        kind: The kind.
+
+    """
 
     grey: NDArray[np.uint8]
     tile: GridFrame
@@ -24,39 +32,47 @@ class Found:
     kind: Kind
 
 
-class Estimator:
-    """One network for each kind, or one for several.
-
-    Raises WeightsError where a network does not take the crops of its card, or gives other numbers than it says.
-    """
+class ParameterEstimator:
+    """The networks that estimate parameters from crops: one for each kind, or one for several."""
 
     def __init__(self, networks: Sequence[Weights]) -> None:
+        """Check the networks against their model cards.
+
+        Raises:
+            WeightsError: A network does not take the crops that its card names, or has another number of outputs.
+
+        """
         self._networks = [_Network(weights) for weights in networks]
-        self._of = {kind: network for network in self._networks for kind in network.kinds}
+        self._network_of = {kind: network for network in self._networks for kind in network.kinds}
 
-    def crop(self, found: Found) -> NDArray[np.uint8]:
-        """What the kind's network sees (pixels, pixels)."""
-        return crop(found.grey, found.box, self._of[found.kind].preset)
+    def crop(self, boxed: BoxedKind) -> NDArray[np.uint8]:
+        """Return the input (pixels, pixels) of the kind's network."""
+        return crop_box(boxed.grey, boxed.box, self._network_of[boxed.kind].preset)
 
-    def __call__(self, found: Sequence[Found]) -> list[Primitive]:
-        """The primitives in boxes, in their order."""
+    def __call__(self, boxed: Sequence[BoxedKind]) -> list[Primitive]:
+        """Estimate the primitives in boxes; they are returned in the order given, map frame.
+
+        Raises:
+            WeightsError: A network gives outputs that are not finite.
+
+        """
         primitives: dict[int, Primitive] = {}
         for network in self._networks:
-            chosen = [i for i, one in enumerate(found) if self._of[one.kind] is network]
+            chosen = [i for i in range(len(boxed)) if self._network_of[boxed[i].kind] is network]
             if not chosen:
                 continue
-            outputs = network.run(np.stack([self.crop(found[i]) for i in chosen]))
+            outputs = network.run(np.stack([self.crop(boxed[i]) for i in chosen]))
             if not np.isfinite(outputs).all():
                 raise WeightsError(f"{network.weights.path} gives no numbers for a crop: make it anew")
             for i, row in zip(chosen, outputs.tolist(), strict=True):
-                one = found[i]
-                own = row[network.preset.span(network.kinds, one.kind)]
-                primitives[i] = read_outputs(one.kind, own, network.preset, one.box, one.tile)
-        return [primitives[i] for i in range(len(found))]
+                kind = boxed[i].kind
+                own = row[network.preset.output_slice(network.kinds, kind)]
+                primitives[i] = decode_parameters(kind, own, network.preset, boxed[i].box, boxed[i].tile)
+        return [primitives[i] for i in range(len(boxed))]
 
 
 class _Network:
-    """One network with what its card says of it."""
+    """One network, checked against its model card."""
 
     def __init__(self, weights: Weights) -> None:
         self.weights = weights
@@ -66,15 +82,15 @@ class _Network:
         self.kinds = [Kind(kind) for kind in weights.card.kinds]
         self._input = weights.session.get_inputs()[0].name
         outputs = self.run(np.zeros((1, self.preset.pixels, self.preset.pixels), np.uint8)).shape[-1]
-        wanted = sum(self.preset.outputs(kind) for kind in self.kinds)
-        if outputs != wanted:
-            raise WeightsError(f"{weights.path} gives {outputs} numbers where its card says {wanted}")
+        expected = sum(self.preset.output_count(kind) for kind in self.kinds)
+        if outputs != expected:
+            raise WeightsError(f"{weights.path} gives {outputs} numbers where its card says {expected}")
 
     def run(self, crops: NDArray[np.uint8]) -> NDArray[np.float32]:
-        """Outputs (N, M) of crops (N, pixels, pixels)."""
+        """Return outputs (N, M) of crops (N, pixels, pixels)."""
         scaled = crops.astype(np.float32)[:, None] / np.float32(255)
         images = np.repeat(scaled, self.weights.card.channels, axis=1)
         try:
             return np.asarray(self.weights.session.run(None, {self._input: images})[0], dtype=np.float32)
-        except Exception as error:  # ONNX Runtime raises many kinds, none of them documented
+        except Exception as error:  # ONNX Runtime raises undocumented exceptions of many types
             raise WeightsError(f"{self.weights.path} does not take crops as its card says") from error

@@ -1,14 +1,15 @@
-"""From a box to a primitive's parameters: the crop that a network sees, and what its outputs mean.
+"""Crops that the parameter networks read, and the encoding of a primitive's parameters in their outputs.
 
-Two ways of doing it, one for each preset:
+There are two presets:
 
-- ``paper`` (III-C): the box is cut out and put in the middle of an empty canvas of 200 x 200 cells, which is shrunk
-  to 50 x 50; the outputs are the parameters themselves, and the primitive lies where its box does.
-- ``prim``: a window of 72 x 72 cells around the box's centre, at the map's own resolution, with what lies around the
-  primitive left in; an angle is two outputs, the cosine and the sine of the angle times the kind's symmetry, so that
-  no angle is torn apart where it wraps around; two more say how far the centroid lies from the window's middle.
-  A triangle's angle would be torn apart where it is equilateral and any corner may be the apex. Its corners are the
-  roots of z³ + p z + q (complex numbers around the centroid, in any order): p and q are its outputs, as lengths.
+- ``paper`` (III-C): the box is cut out and centred on an empty canvas of 200 x 200 cells, which is downsampled to
+  50 x 50; the outputs are the parameters themselves, and the primitive is centred on its box.
+- ``prim``: a window of 72 x 72 cells around the box's centre, at the map's resolution, with the surroundings of the
+  primitive; the angle is encoded as cosine and sine of the symmetry order times the angle, which is continuous where
+  the angle wraps around; two more outputs are the offset of the centroid from the window's centre.
+  A triangle's angle would still be discontinuous where it is equilateral and any corner may be the apex. Its corners
+  are encoded as the coefficients p and q of the polynomial z³ + p z + q whose roots they are (complex numbers
+  relative to the centroid): elementary symmetric functions, which do not depend on the corners' order.
 """
 
 from __future__ import annotations
@@ -26,75 +27,111 @@ from prim.shapes import Kind, Primitive
 Box = tuple[float, float, float, float]
 """Left, top, right, bottom in cells of a tile; row 0 at the top."""
 
-LONGEST = 0.4
-"""Sizes (m) are outputs in units of this."""
+LENGTH_UNIT = 0.4
+"""Unit (m) of outputs that are lengths, which fits the recorder's sizes into 0 to 1; the shipped networks have it."""
+
+MIN_SIZE = 0.001
+"""Smallest size (m) that outputs are decoded to."""
 
 
-def repeats(kind: Kind) -> int | None:
-    """How many times a kind looks the same in one turn; None where it has no angle."""
+def symmetry_order(kind: Kind) -> int | None:
+    """Return the order of a kind's rotational symmetry; None where it has no angle."""
     period = kind.row.period
     return None if period is None else round(2 * math.pi / period)
 
 
-def by_corners(kind: Kind, preset: Preset) -> bool:
-    """Whether a kind's angle and sizes are told by the polynomial of its corners: where it has three."""
-    return preset.vector and kind.corners == 3
-
-
 @dataclass(frozen=True)
 class Preset:
-    """How crops are made and outputs are read.
+    """A way to make crops and to encode parameters.
 
-    ``window`` cells around the box's centre become ``pixels`` x ``pixels``; ``isolated`` leaves only the box in it;
-    ``vector`` makes two outputs of an angle; ``offset`` adds two outputs for where the centroid lies.
+    Attributes:
+        name: Its name in PRESETS and in model cards.
+        window: Side (cells) of the window around the box's centre.
+        pixels: Side (pixels) that the window is downsampled to.
+        isolated: Whether all but the box is blanked out as unknown.
+        angle_as_vector: Whether the angle is encoded as cosine and sine.
+        has_offset: Whether the centroid's offset from the window's centre is encoded.
+
     """
 
     name: str
     window: int
     pixels: int
     isolated: bool
-    vector: bool
-    offset: bool
+    angle_as_vector: bool
+    has_offset: bool
 
-    def angles(self, kind: Kind) -> int:
-        """How many of a kind's outputs tell its angle: they come first."""
-        return 0 if not kind.has_angle else 2 if self.vector else 1
+    def encodes_corners(self, kind: Kind) -> bool:
+        """Return whether angle and sizes are encoded by the polynomial of the corners: those of triangles."""
+        return self.angle_as_vector and kind.corners == 3
 
-    def lengths(self, kind: Kind) -> int:
-        """The first of a kind's outputs that are lengths; those before it are a cosine and a sine, or a share."""
-        return 0 if by_corners(kind, self) else self.angles(kind)
+    def angle_outputs(self, kind: Kind) -> int:
+        """Return how many of a kind's outputs encode its angle: they come first."""
+        return 0 if not kind.has_angle else 2 if self.angle_as_vector else 1
 
-    def outputs(self, kind: Kind) -> int:
-        """How many numbers tell a kind's parameters: angle, offset, sizes."""
-        return self.angles(kind) + 2 * self.offset + len(kind.sizes)
+    def first_length(self, kind: Kind) -> int:
+        """Return the index of a kind's first output in units of LENGTH_UNIT; those before it encode the angle."""
+        return 0 if self.encodes_corners(kind) else self.angle_outputs(kind)
 
-    def span(self, kinds: Sequence[Kind], kind: Kind) -> slice:
-        """Which outputs of a network for several ``kinds`` are one kind's."""
-        first = sum(self.outputs(other) for other in kinds[: kinds.index(kind)])
-        return slice(first, first + self.outputs(kind))
+    def output_count(self, kind: Kind) -> int:
+        """Return how many outputs encode a kind's parameters: angle, offset, sizes, in this order."""
+        return self.angle_outputs(kind) + 2 * self.has_offset + len(kind.sizes)
 
-    def corner(self, box: Box) -> tuple[int, int]:
-        """Column and row of the first cell of the window around a box."""
+    def output_slice(self, kinds: Sequence[Kind], kind: Kind) -> slice:
+        """Return which outputs of a network encode one kind.
+
+        Args:
+            kinds: All kinds of the network, in the order of its outputs.
+            kind: One of them.
+
+        Returns:
+            The slice of the outputs.
+
+        """
+        first = sum(self.output_count(other) for other in kinds[: kinds.index(kind)])
+        return slice(first, first + self.output_count(kind))
+
+    def window_origin(self, box: Box) -> tuple[int, int]:
+        """Return column and row of the first cell of the window around a box."""
         left, top, right, bottom = box
         return round((left + right - self.window) / 2), round((top + bottom - self.window) / 2)
 
-    def centre(self, box: Box, tile: GridFrame) -> tuple[float, float]:
-        """Where (m) the middle of the window around a box of a tile lies."""
-        col, row = self.corner(box)
+    def window_centre(self, box: Box, tile: GridFrame) -> tuple[float, float]:
+        """Return the centre of the window around a box.
+
+        Args:
+            box: The box, in cells of the tile.
+            tile: The tile's frame.
+
+        Returns:
+            x and y (m), map frame.
+
+        """
+        col, row = self.window_origin(box)
         half = self.window / 2
         return (tile.col + col + half) * tile.resolution, (tile.row + row + half) * tile.resolution
 
 
-PAPER = Preset("paper", 200, 50, isolated=True, vector=False, offset=False)
-PRIM = Preset("prim", 72, 72, isolated=False, vector=True, offset=True)
+PAPER = Preset("paper", 200, 50, isolated=True, angle_as_vector=False, has_offset=False)
+PRIM = Preset("prim", 72, 72, isolated=False, angle_as_vector=True, has_offset=True)
 PRESETS = {preset.name: preset for preset in (PAPER, PRIM)}
 
 
-def crop(image: NDArray[np.uint8], box: Box, preset: Preset) -> NDArray[np.uint8]:
-    """The part (pixels, pixels) of a grey image (rows, cols) that a network sees; unknown beyond the image."""
+def crop_box(image: NDArray[np.uint8], box: Box, preset: Preset) -> NDArray[np.uint8]:
+    """Crop an image to the window around a box.
+
+    Args:
+        image: Grey image (rows, cols) of a tile; cells beyond it are unknown.
+        box: The box, in cells of the tile.
+        preset: Size of the window and of the crop.
+
+    Returns:
+        The crop (pixels, pixels).
+
+    """
     rows, cols = image.shape
     left, top, right, bottom = box
-    col, row = preset.corner(box)
+    col, row = preset.window_origin(box)
     window = np.full((preset.window, preset.window), UNKNOWN_GREY, np.uint8)
     first_col, last_col, first_row, last_row = col, col + preset.window, row, row + preset.window
     if preset.isolated:
@@ -105,11 +142,20 @@ def crop(image: NDArray[np.uint8], box: Box, preset: Preset) -> NDArray[np.uint8
     if first_col < last_col and first_row < last_row:
         part = image[first_row:last_row, first_col:last_col]
         window[first_row - row : last_row - row, first_col - col : last_col - col] = part
-    return shrink(window, preset.pixels)
+    return downsample(window, preset.pixels)
 
 
-def shrink(window: NDArray[np.uint8], pixels: int) -> NDArray[np.uint8]:
-    """A square image made smaller by a whole factor: each pixel is the mean of the cells in it."""
+def downsample(window: NDArray[np.uint8], pixels: int) -> NDArray[np.uint8]:
+    """Downsample a square image by an integer factor.
+
+    Args:
+        window: The image (N, N).
+        pixels: Side of the result, a divisor of N.
+
+    Returns:
+        The image (pixels, pixels); each pixel is the mean of its block, rounded.
+
+    """
     factor = len(window) // pixels
     if factor == 1:
         return window
@@ -117,70 +163,90 @@ def shrink(window: NDArray[np.uint8], pixels: int) -> NDArray[np.uint8]:
     return np.asarray(np.rint(blocks.mean(axis=(1, 3))), dtype=np.uint8)
 
 
-def triangle_outputs(primitive: Primitive) -> list[float]:
-    """The coefficients p / |q|^(1/3) and q / |q|^(2/3) (m, complex) of the polynomial whose roots are the corners."""
+def encode_triangle(primitive: Primitive) -> list[float]:
+    """Return real and imaginary part of p / |q|^(1/3), then of q / |q|^(2/3) (m), of the corners' polynomial."""
     corners = primitive.outline() - (primitive.x, primitive.y)
     z = corners[:, 0] + 1j * corners[:, 1]
     p, q = -(z**2).sum() / 2, -(z**3).sum() / 3
     scale = abs(q) ** (1 / 3)
-    return [float(value) for one in (p / scale, q / scale**2) for value in (one.real, one.imag)]
+    return [float(part) for value in (p / scale, q / scale**2) for part in (value.real, value.imag)]
 
 
-def read_triangle(outputs: Sequence[float]) -> tuple[float, list[float]]:
-    """Angle (rad), base and height (m) of the isosceles triangle that :func:`triangle_outputs` tell.
+def decode_triangle(outputs: Sequence[float]) -> tuple[float, list[float]]:
+    """Return angle (rad), base and height (m) of the isosceles triangle that :func:`encode_triangle` encodes.
 
-    The apex is the corner whose sides are most alike.
+    The apex is the root whose distances to the other two differ least.
     """
     q = complex(outputs[2], outputs[3])
     scale = abs(q)
     z = np.roots([1.0, 0.0, complex(outputs[0], outputs[1]) * scale, q * scale**2])
-    unlike = [abs(abs(z[k] - z[k - 1]) - abs(z[k] - z[k - 2])) for k in range(3)]
-    apex = int(np.argmin(unlike))
+    leg_differences = [abs(abs(z[k] - z[k - 1]) - abs(z[k] - z[k - 2])) for k in range(3)]
+    apex = int(np.argmin(leg_differences))
     left, right = z[apex - 1], z[apex - 2]
     up = z[apex] - (left + right) / 2
     return math.atan2(up.imag, up.real) - math.pi / 2, [float(abs(left - right)), float(abs(up))]
 
 
-def targets(primitive: Primitive, preset: Preset) -> NDArray[np.float32]:
-    """What a network should give for a primitive, whose place (m) is given from the middle of its crop's window."""
+def encode_parameters(primitive: Primitive, preset: Preset) -> NDArray[np.float32]:
+    """Encode a primitive: the training targets of a network.
+
+    Args:
+        primitive: The primitive, its centroid relative to the centre of its crop's window (m).
+        preset: The encoding.
+
+    Returns:
+        The outputs (M,) that a network should give.
+
+    """
     values: list[float] = []
-    turns = repeats(primitive.kind)
-    sizes = [size / LONGEST for size in primitive.size]
-    if by_corners(primitive.kind, preset):
-        told = [value / LONGEST for value in triangle_outputs(primitive)]
-        values, sizes = told[:2], told[2:]
-    elif turns is not None:
+    order = symmetry_order(primitive.kind)
+    sizes = [size / LENGTH_UNIT for size in primitive.size]
+    if preset.encodes_corners(primitive.kind):
+        coefficients = [value / LENGTH_UNIT for value in encode_triangle(primitive)]
+        values, sizes = coefficients[:2], coefficients[2:]
+    elif order is not None:
         theta = primitive.theta or 0.0
-        period = 2 * math.pi / turns
-        values = [math.cos(turns * theta), math.sin(turns * theta)] if preset.vector else [theta % period / period]
-    if preset.offset:
-        values += [primitive.x / LONGEST, primitive.y / LONGEST]
+        period = 2 * math.pi / order
+        vector = [math.cos(order * theta), math.sin(order * theta)]
+        values = vector if preset.angle_as_vector else [theta % period / period]
+    if preset.has_offset:
+        values += [primitive.x / LENGTH_UNIT, primitive.y / LENGTH_UNIT]
     return np.array([*values, *sizes], dtype=np.float32)
 
 
-def read_outputs(kind: Kind, outputs: Sequence[float], preset: Preset, box: Box, tile: GridFrame) -> Primitive:
-    """The primitive in a box of a tile that a kind's outputs tell; sizes are a millimetre at least.
+def decode_parameters(kind: Kind, outputs: Sequence[float], preset: Preset, box: Box, tile: GridFrame) -> Primitive:
+    """Decode a kind's outputs.
 
-    Where the outputs tell no offset, its outline's box has its middle where ``box`` has it: a triangle's centroid,
-    for one, is not there.
+    Without an encoded offset the outline's bounding box is centred on ``box``; a triangle's centroid is not there.
+
+    Args:
+        kind: The kind.
+        outputs: Its outputs (M,).
+        preset: The encoding.
+        box: The box, in cells of the tile.
+        tile: The tile's frame.
+
+    Returns:
+        The primitive in the map frame, its sizes at least MIN_SIZE.
+
     """
-    first = preset.angles(kind)
-    turns = repeats(kind)
+    first = preset.angle_outputs(kind)
+    order = symmetry_order(kind)
     theta = None
-    sizes = [float(value) * LONGEST for value in outputs[preset.outputs(kind) - len(kind.sizes) :]]
-    if by_corners(kind, preset):
-        theta, sizes = read_triangle([*(float(value) * LONGEST for value in outputs[:2]), *sizes])
-    elif turns is not None:
-        period = 2 * math.pi / turns
-        theta = math.atan2(outputs[1], outputs[0]) / turns if preset.vector else outputs[0] * period
-    size = tuple(max(value, 0.001) for value in sizes)
-    if preset.offset:
-        x, y = preset.centre(box, tile)
-        x, y = x + outputs[first] * LONGEST, y + outputs[first + 1] * LONGEST
+    sizes = [float(value) * LENGTH_UNIT for value in outputs[preset.output_count(kind) - len(kind.sizes) :]]
+    if preset.encodes_corners(kind):
+        theta, sizes = decode_triangle([*(float(value) * LENGTH_UNIT for value in outputs[:2]), *sizes])
+    elif order is not None:
+        period = 2 * math.pi / order
+        theta = math.atan2(outputs[1], outputs[0]) / order if preset.angle_as_vector else outputs[0] * period
+    size = tuple(max(value, MIN_SIZE) for value in sizes)
+    if preset.has_offset:
+        x, y = preset.window_centre(box, tile)
+        x, y = x + outputs[first] * LENGTH_UNIT, y + outputs[first + 1] * LENGTH_UNIT
         return Primitive(kind, float(x), float(y), theta, size).canonical()
     left, top, right, bottom = box
     x, y = (tile.col + (left + right) / 2) * tile.resolution, (tile.row + (top + bottom) / 2) * tile.resolution
     at_origin = Primitive(kind, 0.0, 0.0, theta, size).canonical()
     outline = at_origin.outline()
-    middle = (outline.min(axis=0) + outline.max(axis=0)) / 2
-    return replace(at_origin, x=float(x - middle[0]), y=float(y - middle[1]))
+    centre = (outline.min(axis=0) + outline.max(axis=0)) / 2
+    return replace(at_origin, x=float(x - centre[0]), y=float(y - centre[1]))

@@ -1,4 +1,4 @@
-"""Maps as images of one size: what a detector is trained on, and what it looks at."""
+"""Maps as images of one size: the tiles that YOLO is trained on and runs on."""
 
 from __future__ import annotations
 
@@ -10,34 +10,44 @@ from numpy.typing import NDArray
 
 from mapping.grid import UNKNOWN_GREY, GridFrame, OccupancyGrid
 
-TILE = 224
-"""Side of an image in cells: a multiple of 32, as YOLO wants it, and enough for the paper's 2 x 2 m and a margin."""
+TILE_SIZE = 224
+"""Side of a tile (cells): a multiple of YOLO's stride of 32 that holds the paper's 2 x 2 m and a margin."""
 
-OVERLAP = 80
-"""Tiles of a larger map overlap by this many cells: a third more than any primitive is wide."""
+TILE_OVERLAP = 80
+"""Smallest overlap (cells) of neighbouring tiles: a third more than the recorder's widest primitive, so that each
+primitive lies whole in some tile."""
 
 STYLES = ("grey", "rounded")
-"""How cells are shown: ``grey`` is OccupancyGrid.image; ``rounded`` is the paper's (III-A): occupied, free or
-unknown, the same in all three channels."""
+"""Rendering of cells: ``grey`` is OccupancyGrid.image; ``rounded`` is the paper's (III-A) occupied, free or unknown,
+the same in all three channels."""
 
 
-def tiles(frame: GridFrame) -> Iterator[GridFrame]:
-    """Frames of TILE x TILE cells that cover a map, evenly spread, each overlapping the next by OVERLAP at least."""
-    for row in _starts(frame.row, frame.rows):
-        for col in _starts(frame.col, frame.cols):
-            yield GridFrame(frame.resolution, row, col, TILE, TILE)
+def tile_frames(frame: GridFrame) -> Iterator[GridFrame]:
+    """Yield frames of TILE_SIZE x TILE_SIZE cells that cover a map, evenly spaced, overlapping by TILE_OVERLAP."""
+    for row in _tile_starts(frame.row, frame.rows):
+        for col in _tile_starts(frame.col, frame.cols):
+            yield GridFrame(frame.resolution, row, col, TILE_SIZE, TILE_SIZE)
 
 
-def _starts(first: int, cells: int) -> list[int]:
-    """Where tiles begin along one axis; a single tile is centred on the map."""
-    if cells <= TILE:
-        return [first - (TILE - cells) // 2]
-    count = math.ceil((cells - OVERLAP) / (TILE - OVERLAP))
-    return [first + round(k * (cells - TILE) / (count - 1)) for k in range(count)]
+def _tile_starts(first: int, cells: int) -> list[int]:
+    """Return the tiles' first cells along one axis; a single tile is centred on the map."""
+    if cells <= TILE_SIZE:
+        return [first - (TILE_SIZE - cells) // 2]
+    count = math.ceil((cells - TILE_OVERLAP) / (TILE_SIZE - TILE_OVERLAP))
+    return [first + round(k * (cells - TILE_SIZE) / (count - 1)) for k in range(count)]
 
 
-def window(grid: OccupancyGrid, tile: GridFrame) -> OccupancyGrid | None:
-    """The part of a map that lies in a tile; None where there is none. Shares the map's memory."""
+def crop_to_tile(grid: OccupancyGrid, tile: GridFrame) -> OccupancyGrid | None:
+    """Return the part of a map within a tile, as a view.
+
+    Args:
+        grid: The map.
+        tile: The tile's frame.
+
+    Returns:
+        The part, which shares the map's memory; None where they do not intersect.
+
+    """
     frame = grid.frame
     row, col = max(tile.row, frame.row), max(tile.col, frame.col)
     last_row = min(tile.row + tile.rows, frame.row + frame.rows)
@@ -49,17 +59,27 @@ def window(grid: OccupancyGrid, tile: GridFrame) -> OccupancyGrid | None:
     return OccupancyGrid(shared, grid.probability[part], None if grid.evidence is None else grid.evidence[part])
 
 
-def cut(grid: OccupancyGrid, tile: GridFrame, style: str = "grey") -> NDArray[np.uint8]:
-    """A tile's image (TILE, TILE, 3), row 0 at the smallest y; what lies beyond the map is unknown."""
+def tile_image(grid: OccupancyGrid, tile: GridFrame, style: str = "grey") -> NDArray[np.uint8]:
+    """Render a tile of a map.
+
+    Args:
+        grid: The map; cells of the tile beyond it are unknown.
+        tile: The tile's frame.
+        style: One of STYLES.
+
+    Returns:
+        The image (rows, cols, 3), row 0 at the smallest y.
+
+    """
     image = np.zeros((tile.rows, tile.cols, 3), np.uint8)
     image[..., slice(0, 1) if style == "grey" else slice(None)] = UNKNOWN_GREY
-    part = window(grid, tile)
+    part = crop_to_tile(grid, tile)
     if part is not None:
-        image[tile.window(part.frame)] = part.image() if style == "grey" else rounded(part)
+        image[tile.window(part.frame)] = part.image() if style == "grey" else rounded_image(part)
     return image
 
 
-def rounded(grid: OccupancyGrid) -> NDArray[np.uint8]:
-    """A map as the paper shows it (rows, cols, 3): 255 occupied, 0 free, UNKNOWN_GREY unknown."""
+def rounded_image(grid: OccupancyGrid) -> NDArray[np.uint8]:
+    """Render a map in the paper's style (rows, cols, 3): 255 occupied, 0 free, UNKNOWN_GREY unknown."""
     grey = np.select((grid.occupied, grid.free), (np.uint8(255), np.uint8(0)), np.uint8(UNKNOWN_GREY))
     return np.repeat(grey[..., None], 3, axis=2)

@@ -1,4 +1,4 @@
-"""Networks as files: ONNX with a model card, run by ONNX Runtime. No such file can run code."""
+"""Network files: ONNX with a model card in the metadata, run by ONNX Runtime. Such a file cannot run code."""
 
 from __future__ import annotations
 
@@ -14,42 +14,47 @@ from prim.errors import PrimError
 from prim.shapes import Kind
 
 if TYPE_CHECKING:
-    pass
-
-if TYPE_CHECKING:
     import onnxruntime
 
 SCHEMA = "prim-weights/1"
 CARD_KEY = "prim"
-"""The card's key in the file's metadata."""
+"""Key of the model card in the file's metadata."""
 
 STAGES = ("yolo", "cnn")
 
-PICKLES = (b"\x80", b"PK")
-"""How a pickle begins, bare or in torch's archive."""
+PICKLE_PREFIXES = (b"\x80", b"PK")
+"""First bytes of a pickle, bare or in torch's archive."""
 
-DETECTOR = "yolo.onnx"
-"""A folder of weights holds YOLO under this name, and the networks that read parameters under any other."""
+DETECTOR_FILE = "yolo.onnx"
+"""Name of YOLO's file in a folder of weights; the parameter networks have any other names."""
 
-ALL_KINDS = tuple(kind.value for kind in Kind)
+KIND_NAMES = tuple(kind.value for kind in Kind)
 
 
 class WeightsError(PrimError):
-    """A weights file that cannot be used: what is wrong with it, and what to do."""
+    """A weights file that cannot be used; the message says why, and what to do."""
 
 
 @dataclass(frozen=True)
-class Card:
-    """What a network is for, and what is known of its making.
+class ModelCard:
+    """Model card of a network: what it is for, and how it was made. The fields are the keys of its JSON.
 
-    ``stage``: yolo or cnn; ``mapper``: whose maps it reads; ``kinds``: in the order of its outputs; ``preset``: how a
-    cnn's crops are made (networks.parameters); ``style``: how cells are shown (tiles.STYLES); ``resolution``: of
-    the maps (m); ``thresholds``: of a yolo, the least score per kind; ``about``: data, options, metrics.
+    Attributes:
+        stage: ``yolo`` or ``cnn``.
+        mapper: Name of the mapper whose maps it reads.
+        kinds: Names of the kinds, in the order of its outputs.
+        preset: Of a cnn, the name of its crops and encoding (parameters.PRESETS).
+        channels: Of a cnn, how many channels its crops have: 1, or 3 that are the same.
+        style: Rendering of cells (tiles.STYLES).
+        resolution: Side of the maps' cells (m).
+        thresholds: Of a yolo, the smallest score of a detection by kind.
+        about: Data, options and metrics of the training.
+
     """
 
     stage: str
     mapper: str
-    kinds: tuple[str, ...] = ALL_KINDS
+    kinds: tuple[str, ...] = KIND_NAMES
     preset: str | None = None
     channels: int = 3
     style: str = "grey"
@@ -58,47 +63,70 @@ class Card:
     about: Mapping[str, Any] = field(default_factory=dict)
 
     def to_json(self) -> str:
-        """As it stands in the file."""
+        """Return the JSON text that is stored in the file."""
         return json.dumps({"schema": SCHEMA} | vars(self))
 
     @classmethod
-    def from_json(cls, text: str) -> Card:
-        """Reads a card. Raises ValueError on one that is none."""
+    def from_json(cls, text: str) -> ModelCard:
+        """Parse a model card.
+
+        Raises:
+            ValueError: The text is no model card of this schema, or has unknown fields or impossible values.
+
+        """
         value = json.loads(text)
         if not isinstance(value, dict) or value.pop("schema", None) != SCHEMA:
             raise ValueError(f"no {SCHEMA}")
         try:
-            card = cls(**value | {"kinds": tuple(value.get("kinds", ALL_KINDS))})
+            card = cls(**value | {"kinds": tuple(value.get("kinds", KIND_NAMES))})
         except TypeError as error:
             raise ValueError(str(error)) from error
         card._check()
         return card
 
     def _check(self) -> None:
-        """Raises ValueError on what no card of ours says."""
-        known = self.stage in STAGES and self.style in STYLES and all(kind in ALL_KINDS for kind in self.kinds)
+        """Raise ValueError on values that no exported model card has."""
+        known = self.stage in STAGES and self.style in STYLES and all(kind in KIND_NAMES for kind in self.kinds)
         if not known or not isinstance(self.mapper, str) or self.channels not in (1, 3):
             raise ValueError("an unknown stage, kind, style, mapper or number of channels")
         if not isinstance(self.resolution, float) or not self.resolution > 0:
-            raise ValueError("a resolution that is none")
+            raise ValueError("an impossible resolution")
         scores = self.thresholds.values() if isinstance(self.thresholds, Mapping) else [None]
         if not all(isinstance(score, float) and 0 <= score <= 1 for score in scores):
-            raise ValueError("thresholds that are none")
+            raise ValueError("impossible thresholds")
 
 
 @dataclass(frozen=True)
 class Weights:
-    """A network that is ready to run, and its card."""
+    """A loaded network.
+
+    Attributes:
+        path: Its file.
+        card: Its model card.
+        session: ONNX Runtime's session.
+
+    """
 
     path: Path
-    card: Card
+    card: ModelCard
     session: onnxruntime.InferenceSession
 
 
 def load_weights(path: Path, stage: str, mapper: str | None = None, threads: int | None = None) -> Weights:
-    """Opens a network of a ``stage``, for the maps of ``mapper`` where one is named; runs on all cores by default.
+    """Load a network.
 
-    Raises WeightsError on a file that is missing, corrupt, a pickle, without a card, or for something else.
+    Args:
+        path: Its ONNX file.
+        stage: The stage it must be for: ``yolo`` or ``cnn``.
+        mapper: The mapper whose maps it must read; None: any.
+        threads: Threads that run it; None: one for each core.
+
+    Returns:
+        The network, ready to run.
+
+    Raises:
+        WeightsError: The file is missing, damaged, a pickle, without a model card, or for something else.
+
     """
     import onnxruntime
 
@@ -106,20 +134,20 @@ def load_weights(path: Path, stage: str, mapper: str | None = None, threads: int
         content = path.read_bytes()
     except OSError as error:
         raise WeightsError(f"{path}: {error.strerror or error}") from error
-    if content.startswith(PICKLES):
+    if content.startswith(PICKLE_PREFIXES):
         raise WeightsError(f"{path} is a pickle, which can run code: make an ONNX file of it with prim-train export")
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = threads or len(os.sched_getaffinity(0))
-    # Threads that wait for a network in a loop take the cores from what runs beside it.
+    # Threads that spin while they wait for work take the cores from whatever else runs.
     options.add_session_config_entry("session.intra_op.allow_spinning", "0")
     options.log_severity_level = 4
     try:
         session = onnxruntime.InferenceSession(content, options, providers=["CPUExecutionProvider"])
-    except Exception as error:  # ONNX Runtime raises many kinds, none of them documented
+    except Exception as error:  # ONNX Runtime raises undocumented exceptions of many types
         what = f"{path} is no ONNX network, or a damaged one"
         raise WeightsError(f"{what}: make it anew with prim-train export") from error
     try:
-        card = Card.from_json(session.get_modelmeta().custom_metadata_map.get(CARD_KEY, "null"))
+        card = ModelCard.from_json(session.get_modelmeta().custom_metadata_map.get(CARD_KEY, "null"))
     except ValueError as error:
         raise WeightsError(f"{path} has no model card ({error}): make it anew with prim-train export") from error
     if card.stage != stage:
@@ -129,13 +157,25 @@ def load_weights(path: Path, stage: str, mapper: str | None = None, threads: int
     return Weights(path, card, session)
 
 
-def load_set(path: Path, mapper: str | None = None, threads: int | None = None) -> tuple[Weights, list[Weights]]:
-    """Opens a YOLO and the networks that read parameters beside it: a folder, or the YOLO's own file in it.
+def load_weight_set(
+    path: Path, mapper: str | None = None, threads: int | None = None
+) -> tuple[Weights, list[Weights]]:
+    """Load a YOLO network and the parameter networks beside it.
 
-    Raises WeightsError as :func:`load_weights`, and where a kind's network is missing, there twice, or does not go
-    with the YOLO.
+    Args:
+        path: A folder of weights, or YOLO's file in it.
+        mapper: The mapper whose maps the networks must read; None: any.
+        threads: Threads that run each network; None: one for each core.
+
+    Returns:
+        YOLO, and the parameter networks.
+
+    Raises:
+        WeightsError: As :func:`load_weights`; or a kind has no parameter network or several, or the networks were
+            trained on images of another style or resolution than YOLO.
+
     """
-    detector = path / DETECTOR if path.is_dir() else path
+    detector = path / DETECTOR_FILE if path.is_dir() else path
     yolo = load_weights(detector, "yolo", mapper, threads)
     others = sorted(other for other in detector.parent.glob("*.onnx") if other.name != detector.name)
     networks = [load_weights(other, "cnn", yolo.card.mapper, threads) for other in others]
@@ -143,9 +183,9 @@ def load_set(path: Path, mapper: str | None = None, threads: int | None = None) 
         if (network.card.style, network.card.resolution) != (yolo.card.style, yolo.card.resolution):
             raise WeightsError(f"{network.path} reads other images than {yolo.path}: they are of different sets")
     kinds = [kind for network in networks for kind in network.card.kinds]
-    twice = [kind for kind in ALL_KINDS if kinds.count(kind) > 1]
-    if twice:
-        raise WeightsError(f"{detector.parent} holds several networks for: {', '.join(twice)}; keep one of each")
+    duplicates = [kind for kind in KIND_NAMES if kinds.count(kind) > 1]
+    if duplicates:
+        raise WeightsError(f"{detector.parent} holds several networks for: {', '.join(duplicates)}; keep one of each")
     missing = set(yolo.card.kinds).difference(kinds)
     if missing:
         what = ", ".join(sorted(missing))
@@ -154,10 +194,10 @@ def load_set(path: Path, mapper: str | None = None, threads: int | None = None) 
 
 
 SHIPPED = Path(__file__).parent / "shipped"
-"""The weights that come with prim: a folder for each mapper."""
+"""The weights that come with prim: one folder for each mapper."""
 
 
 def shipped_weights(mapper: str) -> Path | None:
-    """The weights for a mapper's maps that come with prim; None where none do."""
+    """Return the folder of the weights that come with prim for a mapper's maps; None where there is none."""
     folder = SHIPPED / mapper
     return folder if folder.is_dir() else None

@@ -1,4 +1,4 @@
-"""YOLO on ONNX Runtime: images to boxes with kinds and scores."""
+"""YOLOv5 on ONNX Runtime: from images to candidate boxes with kinds and scores; non-maximum suppression."""
 
 from __future__ import annotations
 
@@ -8,17 +8,14 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from detect.networks.tiles import TILE
+from detect.networks.tiles import TILE_SIZE
 from detect.networks.weights import Weights, WeightsError
 from prim.shapes import Kind
 
 KINDS = tuple(Kind)
-"""The classes' order."""
+"""The kind of each class index, in labels, candidates and ground truth."""
 
 CHANNELS = 3
-
-MANY = 3000
-"""From so many candidates on, suppression looks at neighbours only."""
 
 BoxArray = NDArray[np.float32]
 """(N, 4): left, top, right, bottom in cells; row 0 at the top."""
@@ -26,7 +23,14 @@ BoxArray = NDArray[np.float32]
 
 @dataclass(frozen=True)
 class Boxes:
-    """Candidates of one image: ``box`` (N, 4), ``kind`` (N,) as an index of KINDS, ``score`` (N,)."""
+    """Candidates of one image.
+
+    Attributes:
+        box: (N, 4) left, top, right, bottom in cells.
+        kind: (N,) class indices (of KINDS).
+        score: (N,) class scores, 0 to 1.
+
+    """
 
     box: BoxArray
     kind: NDArray[np.intp]
@@ -38,13 +42,22 @@ class Boxes:
     def __getitem__(self, chosen: NDArray[np.bool_] | NDArray[np.intp]) -> Boxes:
         return Boxes(self.box[chosen], self.kind[chosen], self.score[chosen])
 
-    def moved(self, cols: int, rows: int) -> Boxes:
-        """The same, moved by whole cells."""
+    def translated(self, cols: int, rows: int) -> Boxes:
+        """Return the candidates translated by whole cells.
+
+        Args:
+            cols: Translation along x (cells).
+            rows: Translation along y (cells).
+
+        Returns:
+            Candidates of the same kinds and scores.
+
+        """
         return Boxes(self.box + np.array([cols, rows, cols, rows], np.float32), self.kind, self.score)
 
     @classmethod
-    def joined(cls, parts: Sequence[Boxes]) -> Boxes:
-        """All parts, one after the other."""
+    def concatenate(cls, parts: Sequence[Boxes]) -> Boxes:
+        """Return the candidates of all parts, in their order."""
         if not parts:
             return cls(np.empty((0, 4), np.float32), np.empty(0, np.intp), np.empty(0, np.float32))
         box, kind, score = ([getattr(part, name) for part in parts] for name in ("box", "kind", "score"))
@@ -52,100 +65,143 @@ class Boxes:
 
 
 class Yolo:
-    """A network that finds primitives in tiles.
+    """A YOLOv5 network that detects primitives in tiles.
 
-    Raises WeightsError where the network does not take tiles or does not give the kinds of its card.
+    Attributes:
+        weights: The network and its model card.
+
     """
 
     def __init__(self, weights: Weights) -> None:
+        """Check the network against its model card.
+
+        Raises:
+            WeightsError: The network does not take tiles, or does not give boxes of the kinds of its card.
+
+        """
         self.weights = weights
         self._input = weights.session.get_inputs()[0].name
-        shape = self._run(np.zeros((1, CHANNELS, TILE, TILE), np.float32)).shape
+        shape = self._run(np.zeros((1, CHANNELS, TILE_SIZE, TILE_SIZE), np.float32)).shape
         self._kinds = np.array([KINDS.index(Kind(name)) for name in weights.card.kinds], np.intp)
         if len(shape) != 3 or shape[1] != 4 + len(self._kinds):
-            wanted = f"boxes of {len(self._kinds)} kinds"
-            raise WeightsError(f"{weights.path} gives {shape}, not {wanted}: it is no detector")
+            expected = f"boxes of {len(self._kinds)} kinds"
+            raise WeightsError(f"{weights.path} gives {shape}, not {expected}: it is no detector")
 
-    def __call__(self, images: NDArray[np.uint8], floor: float, every_kind: bool = False) -> list[Boxes]:
-        """What may be in images (N, TILE, TILE, 3): candidates with a score of ``floor`` or more.
+    def __call__(self, images: NDArray[np.uint8], score_floor: float, multi_label: bool = False) -> list[Boxes]:
+        """Return the candidates of a batch of images, before non-maximum suppression.
 
-        A place is one candidate, of its likeliest kind; with ``every_kind`` one for each kind, as YOLOv5's own
-        evaluation has it. Many candidates lie on each other: see :func:`suppress`.
+        Args:
+            images: (N, TILE_SIZE, TILE_SIZE, 3).
+            score_floor: Smallest class score of a candidate.
+            multi_label: Whether an anchor is a candidate for each kind that reaches the floor, as in YOLOv5's
+                validation, or for the one with the largest score only.
+
+        Returns:
+            The candidates of each image.
+
+        Raises:
+            WeightsError: The network does not take the images.
+
         """
         scaled = np.ascontiguousarray(images.transpose(0, 3, 1, 2), dtype=np.float32) / np.float32(255)
-        return [_candidates(output, self._kinds, floor, every_kind) for output in self._run(scaled)]
+        return [_decode_anchors(output, self._kinds, score_floor, multi_label) for output in self._run(scaled)]
 
     def _run(self, images: NDArray[np.float32]) -> NDArray[np.float32]:
         try:
             return np.asarray(self.weights.session.run(None, {self._input: images})[0], dtype=np.float32)
-        except Exception as error:  # ONNX Runtime raises many kinds, none of them documented
-            wanted = f"images of {CHANNELS} x {TILE} x {TILE}"
-            raise WeightsError(f"{self.weights.path} does not take {wanted}: it is no detector") from error
+        except Exception as error:  # ONNX Runtime raises undocumented exceptions of many types
+            expected = f"images of {CHANNELS} x {TILE_SIZE} x {TILE_SIZE}"
+            raise WeightsError(f"{self.weights.path} does not take {expected}: it is no detector") from error
 
 
-def _candidates(output: NDArray[np.float32], kinds: NDArray[np.intp], floor: float, every_kind: bool) -> Boxes:
-    """Boxes of one image from the network's output (4 + K, anchors): centre, size, scores of the K ``kinds``."""
+def _decode_anchors(
+    output: NDArray[np.float32], kinds: NDArray[np.intp], score_floor: float, multi_label: bool
+) -> Boxes:
+    """Return candidates of one image from output (4 + K, anchors): centre, size, scores of the K ``kinds``."""
     scores = output[4:]
-    if every_kind:
-        kind, anchor = np.nonzero(scores >= floor)
+    if multi_label:
+        kind, anchor = np.nonzero(scores >= score_floor)
     else:
         best = scores.argmax(axis=0)
-        anchor = np.flatnonzero(scores[best, np.arange(scores.shape[1])] >= floor)
+        anchor = np.flatnonzero(scores[best, np.arange(scores.shape[1])] >= score_floor)
         kind = best[anchor]
     score = scores[kind, anchor]
     centre, half = output[0:2, anchor].T, output[2:4, anchor].T / 2
     return Boxes(np.concatenate((centre - half, centre + half), axis=1), kinds[kind], score)
 
 
-def overlap(box: BoxArray, others: BoxArray) -> NDArray[np.float32]:
-    """Intersection over union of one box (4,) with others (N, 4)."""
+def box_iou(box: BoxArray, others: BoxArray) -> NDArray[np.float32]:
+    """Compute the intersection over union of one box with others.
+
+    Args:
+        box: (4,).
+        others: (N, 4).
+
+    Returns:
+        (N,), 0 to 1.
+
+    """
     low, high = np.maximum(box[:2], others[:, :2]), np.minimum(box[2:], others[:, 2:])
     shared = np.clip(high - low, 0, None).prod(axis=1)
     areas = (others[:, 2:] - others[:, :2]).prod(axis=1)
     return np.asarray(shared / np.maximum((box[2:] - box[:2]).prod() + areas - shared, 1e-9), dtype=np.float32)
 
 
-def suppress(
-    boxes: Boxes, limit: float, per_kind: bool = False, among: NDArray[np.bool_] | None = None
+def non_maximum_suppression(
+    boxes: Boxes,
+    max_iou: float,
+    per_kind: bool = False,
+    eligible: NDArray[np.bool_] | None = None,
+    hash_above: int = 3000,
 ) -> NDArray[np.intp]:
-    """By which better candidate each is suppressed (N,): its index; its own where it stays.
+    """Suppress candidates that overlap a better one: greedy, in descending order of score.
 
-    Greedy, best first: what overlaps a better one by more than ``limit`` (IoU) goes; with ``per_kind`` only where
-    both are of one kind. Candidates that are not ``among`` take no part, and have -1.
+    Args:
+        boxes: The candidates (N).
+        max_iou: Largest intersection over union with a better candidate that stays.
+        per_kind: Whether a candidate is suppressed by candidates of its own kind only.
+        eligible: (N,) which candidates take part; None: all.
+        hash_above: With more candidates than this, each is compared with those nearby only (spatial hashing); the
+            result is the same. Set by hand.
+
+    Returns:
+        (N,) for each candidate the index of the one that suppresses it, its own where it stays, -1 where it is not
+        eligible.
+
     """
-    by = np.full(len(boxes), -1, np.intp)
+    suppressor = np.full(len(boxes), -1, np.intp)
     order = np.argsort(-boxes.score, kind="stable")
-    if among is not None:
-        order = order[among[order]]
-    if len(order) > MANY:
-        return _suppress_many(boxes, limit, per_kind, order, by)
+    if eligible is not None:
+        order = order[eligible[order]]
+    if len(order) > hash_above:
+        return _suppress_hashed(boxes, max_iou, per_kind, order, suppressor)
     while len(order):
         best, rest = order[0], order[1:]
-        by[best] = best
-        gone = overlap(boxes.box[best], boxes.box[rest]) > limit
+        suppressor[best] = best
+        overlapping = box_iou(boxes.box[best], boxes.box[rest]) > max_iou
         if per_kind:
-            gone &= boxes.kind[rest] == boxes.kind[best]
-        by[rest[gone]] = best
-        order = rest[~gone]
-    return by
+            overlapping &= boxes.kind[rest] == boxes.kind[best]
+        suppressor[rest[overlapping]] = best
+        order = rest[~overlapping]
+    return suppressor
 
 
-def _suppress_many(
-    boxes: Boxes, limit: float, per_kind: bool, order: NDArray[np.intp], by: NDArray[np.intp]
+def _suppress_hashed(
+    boxes: Boxes, max_iou: float, per_kind: bool, order: NDArray[np.intp], suppressor: NDArray[np.intp]
 ) -> NDArray[np.intp]:
-    """The same for so many that not each can be held against all: only what lies near is looked at."""
+    """Suppress as :func:`non_maximum_suppression`, comparing boxes in neighbouring buckets of the plane only."""
     side = float((boxes.box[order, 2:] - boxes.box[order, :2]).max())
-    places = np.floor(boxes.box[:, :2] / max(side, 1.0)).astype(int).tolist()
+    buckets = np.floor(boxes.box[:, :2] / max(side, 1.0)).astype(int).tolist()
     kept: dict[tuple[int, int], list[int]] = {}
     for i in order.tolist():
-        col, row = places[i]
+        col, row = buckets[i]
         near = [k for c in (-1, 0, 1) for r in (-1, 0, 1) for k in kept.get((col + c, row + r), ())]
         if per_kind:
             near = [k for k in near if boxes.kind[k] == boxes.kind[i]]
-        over = np.flatnonzero(overlap(boxes.box[i], boxes.box[near]) > limit) if near else ()
-        if len(over):
-            by[i] = max((near[k] for k in over), key=lambda k: boxes.score[k])
+        overlapping = np.flatnonzero(box_iou(boxes.box[i], boxes.box[near]) > max_iou) if near else ()
+        if len(overlapping):
+            suppressor[i] = max((near[k] for k in overlapping), key=lambda k: boxes.score[k])
         else:
-            by[i] = i
+            suppressor[i] = i
             kept.setdefault((col, row), []).append(i)
-    return by
+    return suppressor

@@ -1,1 +1,1 @@
-"""Training sets, networks in torch, and how weights are made."""
+"""Data sets, the networks in torch, their training and export."""

@@ -1,16 +1,16 @@
 """Training data: recorded sessions, mapped by every mapper from the same rays, as images with exact primitives.
 
-A set is a folder:
+A data set is a folder:
 
-    manifest.json                 the options, so that the same set can be made again
-    truth/train/000012_0.json     one tile: where it lies, its primitives, how it was recorded
-    images/prob/train/000012_0.png    the tile as each mapper maps it (networks.tiles.cut, row 0 at the smallest y)
-    labels/prob/train/000012_0.txt    the same tile's outlines as YOLO reads them
-    prob.yaml                     what ultralytics trains from
-    done/train/000012             says that all tiles of a session are there
+    manifest.json                 the options, which make the same data set again
+    truth/train/000012_0.json     one tile: its frame, its primitives, how it was recorded
+    images/prob/train/000012_0.png    the tile of each mapper's map (tiles.tile_image, row 0 at the smallest y)
+    labels/prob/train/000012_0.txt    the outlines in the tile, as YOLO's labels
+    prob.yaml                     data description for ultralytics
+    done/train/000012             marks a session all of whose tiles are written
 
-Everything follows from a session's seed: sessions are made in parallel, one that is there already is not made again,
-and a set that was interrupted goes on where it stopped. This is the one part of ``detect`` that uses ``recorder``.
+Everything follows from the session's seed: sessions are made in parallel, finished ones are skipped, so that an
+interrupted run can be continued. In ``detect`` only training and evaluation use ``recorder``.
 """
 
 from __future__ import annotations
@@ -27,48 +27,63 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from detect.networks.tiles import TILE, cut, tiles
+from detect.networks.parameters import Box
+from detect.networks.tiles import TILE_SIZE, tile_frames, tile_image
+from detect.networks.weights import KIND_NAMES
+from detect.networks.yolo import KINDS
 from mapping.grid import GridFrame, OccupancyGrid
 from mapping.mapper import MAPPERS, make_mapper
 from prim.errors import OutputError, UsageError
-from prim.log.mcap import LogReader
-from prim.log.messages import POSE_TYPE, SCAN_TOPIC, TRUE_POSE_TOPIC, decode_poses, decode_scan, planar
+from prim.log import open_log
+from prim.log.messages import POSE_TYPE, SCAN_TOPIC, TRUE_POSE_TOPIC, decode_poses, decode_scan, planar_pose
 from prim.scan import Scan
 from prim.se2 import Pose2D, Trajectory
 from prim.shapes import Kind, Primitive
 from prim.world import Bounds, World
 from recorder.sensors import Lidar
-from recorder.session import SessionOptions, record
+from recorder.session import SessionOptions, record_session
 from recorder.world import WorldOptions
 
-MARGIN = 0.1
-"""A map reaches this far (m) beyond the floor."""
+MAP_MARGIN = 0.1
+"""Margin (m) of a map around the floor."""
 
-LEAST_INSIDE = 0.6
-"""A primitive belongs to a tile that holds at least this share of its outline."""
-
-KINDS = tuple(Kind)
-"""The classes' order in labels."""
+MIN_INSIDE_SHARE = 0.6
+"""A primitive belongs to a tile that holds at least this share of its outline; set by hand."""
 
 SPLITS = ("train", "val")
 
 Progress = Callable[[int, int], None]
+"""Called with what is done and what there is in all."""
 
 
 @dataclass(frozen=True)
-class SetOptions:
-    """What a set holds. Raises UsageError on what cannot be.
+class DatasetOptions:
+    """Contents of a data set; the fields are the keys of its manifest.
 
-    ``sizes`` are the splits' sessions; each draws one of ``noise_stds`` (m), ``rays``, ``floors`` (side, m) and
-    ``motions``, has walls with the chance ``walled``, and is mapped by each of ``mappers``.
-    Images of the mappers that are ``rounded`` show cells as occupied, free or unknown only (networks.tiles.STYLES).
+    Attributes:
+        sizes: Sessions of each of SPLITS.
+        seed: Seed of the first session; the others' follow.
+        noise_stds: Standard deviations of the range noise (m); each session draws one.
+        mappers: Names of the mappers that map each session.
+        kinds: Names of the kinds that sessions hold.
+        rays: Rays of a scan; each session draws one.
+        stops: Stops along each axis of a warped session on a floor of 2 m, more on larger ones; each draws one.
+        floors: Sides (m) of the square floor; each session draws one.
+        motions: ``warp`` or ``drive``; each session draws one.
+        walled: Share of the sessions with walls.
+        resolution: Side of a cell (m).
+        rounded: Mappers whose images are in the style ``rounded`` (networks.tiles.STYLES).
+
+    Raises:
+        UsageError: The options are impossible.
+
     """
 
     sizes: tuple[int, int] = (500, 125)
     seed: int = 100_000
     noise_stds: tuple[float, ...] = (0.0,)
     mappers: tuple[str, ...] = MAPPERS
-    kinds: tuple[str, ...] = tuple(kind.value for kind in KINDS)
+    kinds: tuple[str, ...] = KIND_NAMES
     rays: tuple[int, ...] = (500,)
     stops: tuple[int, ...] = (10,)
     floors: tuple[float, ...] = (2.0,)
@@ -90,9 +105,9 @@ class SetOptions:
             raise UsageError(f"walled is {self.walled:g}: it is a share, from 0 to 1")
 
 
-PRESETS = {
-    "paper": SetOptions(rounded=("det", "prob")),
-    "mixed": SetOptions(
+DATASET_PRESETS = {
+    "paper": DatasetOptions(rounded=("det", "prob")),
+    "mixed": DatasetOptions(
         sizes=(600, 60),
         seed=200_000,
         noise_stds=(0.0, 0.02, 0.05, 0.075, 0.1, 0.25, 0.375, 0.5),
@@ -103,30 +118,38 @@ PRESETS = {
         walled=0.7,
     ),
 }
-PRESETS["large"] = replace(PRESETS["mixed"], sizes=(2400, 60), seed=210_000)
-"""The paper's sets (III-B, IV-B: 500 and 125 maps, one noise level each, rounded), one that shipped networks begin
-with, and a larger one that they go on with.
-"""
+DATASET_PRESETS["large"] = replace(DATASET_PRESETS["mixed"], sizes=(2400, 60), seed=210_000)
+"""The paper's data sets (III-B, IV-B: 500 and 125 maps, one noise level each, rounded); the one that the shipped
+networks were first trained on; and the larger one that their training was continued on."""
 
 
-def sessions(options: SetOptions) -> Iterator[tuple[str, int]]:
-    """Split and seed of every session."""
+def session_seeds(options: DatasetOptions) -> Iterator[tuple[str, int]]:
+    """Yield split and seed of every session."""
     first = 0
     for split, size in zip(SPLITS, options.sizes, strict=True):
         yield from ((split, options.seed + first + k) for k in range(size))
         first += size
 
 
-def session_options(options: SetOptions, seed: int) -> SessionOptions:
-    """How the session of a seed is recorded; drawn from the seed alone."""
+def session_options(options: DatasetOptions, seed: int) -> SessionOptions:
+    """Draw how a session is recorded.
+
+    Args:
+        options: What is drawn from.
+        seed: Seed of the session, the only source of randomness.
+
+    Returns:
+        The session's options.
+
+    """
     rng = np.random.default_rng((seed, 1))
     floor = float(rng.choice(options.floors))
-    most = max(2, round(2 * (floor / 2) ** 2))
+    max_per_kind = max(2, round(2 * (floor / 2) ** 2))
     stops = max(2, round(int(rng.choice(options.stops)) * floor / 2))
     world = WorldOptions(
         size=(floor, floor),
         kinds=tuple(Kind(kind) for kind in options.kinds),
-        per_kind=(0, most),
+        per_kind=(0, max_per_kind),
         walls=bool(rng.random() < options.walled),
     )
     lidar = Lidar(rays=int(rng.choice(options.rays)), noise_std=float(rng.choice(options.noise_stds)))
@@ -136,13 +159,27 @@ def session_options(options: SetOptions, seed: int) -> SessionOptions:
     )
 
 
-def make(folder: Path, options: SetOptions, progress: Progress | None = None, workers: int | None = None) -> int:
-    """Makes a set, or what is missing of it; returns how many sessions were made now.
+def make_dataset(
+    folder: Path, options: DatasetOptions, progress: Progress | None = None, workers: int | None = None
+) -> int:
+    """Make a data set, or what is missing of it.
 
-    Raises UsageError where the folder holds a set of other options, OutputError where it cannot be written.
+    Args:
+        folder: Its folder.
+        options: Its contents.
+        progress: Called after each session.
+        workers: Processes; None: one for each core.
+
+    Returns:
+        How many sessions were made now.
+
+    Raises:
+        UsageError: The folder holds a data set with other options.
+        OutputError: The folder cannot be written.
+
     """
-    _begin(folder, options)
-    missing = [job for job in sessions(options) if not _done(folder, *job).exists()]
+    _prepare_folder(folder, options)
+    missing = [job for job in session_seeds(options) if not _done(folder, *job).exists()]
     with ProcessPoolExecutor(workers or len(os.sched_getaffinity(0))) as pool:
         futures = [pool.submit(_make_session, folder, options, split, seed) for split, seed in missing]
         for count, future in enumerate(as_completed(futures), start=1):
@@ -150,13 +187,13 @@ def make(folder: Path, options: SetOptions, progress: Progress | None = None, wo
             if progress:
                 progress(count, len(missing))
     for mapper in options.mappers:
-        write_yaml(folder, mapper)
+        write_data_yaml(folder, mapper)
     return len(missing)
 
 
-def _begin(folder: Path, options: SetOptions) -> None:
-    """Makes the folders and the manifest, or checks that the manifest is this set's."""
-    manifest = json.dumps({"version": 1, "tile": TILE} | asdict(options), indent=1) + "\n"
+def _prepare_folder(folder: Path, options: DatasetOptions) -> None:
+    """Make the folders and the manifest, or check that the manifest is that of these options."""
+    manifest = json.dumps({"version": 1, "tile": TILE_SIZE} | asdict(options), indent=1) + "\n"
     path = folder / "manifest.json"
     try:
         if path.exists() and path.read_text(encoding="utf-8") != manifest:
@@ -173,29 +210,27 @@ def _begin(folder: Path, options: SetOptions) -> None:
 
 
 def _done(folder: Path, split: str, seed: int) -> Path:
-    """The file that says that all tiles of a session are there."""
+    """Return the file that marks a finished session."""
     return folder / "done" / split / f"{seed:06d}"
 
 
-def _make_session(folder: Path, options: SetOptions, split: str, seed: int) -> None:
-    """Records, maps and cuts one session."""
+def _make_session(folder: Path, options: DatasetOptions, split: str, seed: int) -> None:
+    """Record and map one session, and write its tiles."""
     session = session_options(options, seed)
-    world, scans = recorded(session)
-    x0, y0, x1, y1 = world.bounds
-    bounds = (x0 - MARGIN, y0 - MARGIN, x1 + MARGIN, y1 + MARGIN)
-    frame = GridFrame.covering(bounds, options.resolution)
+    world, scans = simulate_session(session)
+    frame = map_frame(world, options.resolution)
     grids = {mapper: map_scans(mapper, scans, options.resolution, frame.bounds) for mapper in options.mappers}
-    for number, tile in enumerate(tiles(frame)):
-        held = held_in(tile, world.primitives)
+    for number, tile in enumerate(tile_frames(frame)):
+        primitives = primitives_in_tile(world.primitives, tile)
         name = f"{seed:06d}_{number}"
         for mapper, grid in grids.items():
             style = "rounded" if mapper in options.rounded else "grey"
-            write_image(folder / "images" / mapper / split / f"{name}.png", cut(grid, tile, style))
-            label = "".join(yolo_line(primitive, tile) for primitive in held)
+            write_image(folder / "images" / mapper / split / f"{name}.png", tile_image(grid, tile, style))
+            label = "".join(yolo_label(primitive, tile) for primitive in primitives)
             (folder / "labels" / mapper / split / f"{name}.txt").write_text(label, encoding="utf-8")
         truth = {
             "frame": asdict(tile),
-            "primitives": [primitive.to_json() for primitive in held],
+            "primitives": [primitive.to_json() for primitive in primitives],
             "noise_std": session.lidar.noise_std,
             "rays": session.lidar.rays,
             "motion": session.motion,
@@ -205,23 +240,39 @@ def _make_session(folder: Path, options: SetOptions, split: str, seed: int) -> N
     _done(folder, split, seed).touch()
 
 
-def recorded(session: SessionOptions) -> tuple[World, list[tuple[Scan, Pose2D]]]:
-    """A session that is recorded for the purpose: its world, and its scans with the true poses of their laser."""
+def map_frame(world: World, resolution: float) -> GridFrame:
+    """Return the frame of a world's map.
+
+    Args:
+        world: The world.
+        resolution: Side of a cell (m).
+
+    Returns:
+        A frame that covers the floor and MAP_MARGIN around it.
+
+    """
+    x0, y0, x1, y1 = world.bounds
+    bounds = (x0 - MAP_MARGIN, y0 - MAP_MARGIN, x1 + MAP_MARGIN, y1 + MAP_MARGIN)
+    return GridFrame.covering(bounds, resolution)
+
+
+def simulate_session(session: SessionOptions) -> tuple[World, list[tuple[Scan, Pose2D]]]:
+    """Record a session into a temporary log; return its world, and its scans with the laser's true poses."""
     with tempfile.TemporaryDirectory() as scratch:
         path = Path(scratch) / "session.mcap"
-        return record(path, session).world, read_scans(path)
+        return record_session(path, session).world, read_scans(path)
 
 
 def read_scans(path: Path) -> list[tuple[Scan, Pose2D]]:
-    """A recorded log's scans with the true poses of their laser."""
-    with LogReader(path) as log:
+    """Read a recorded log's scans with the laser's true poses (map frame), interpolated to their stamps."""
+    with open_log(path) as log:
         topics = log.topics
         stamped = [
             pose
             for _, poses in log.decoded(topics[TRUE_POSE_TOPIC], lambda data: decode_poses(POSE_TYPE, data))
             for pose in poses
         ]
-        planes = [planar(pose) for pose in stamped]
+        planes = [planar_pose(pose) for pose in stamped]
         truth = Trajectory.from_unsorted(
             [pose.stamp for pose in stamped], [(pose.x, pose.y, pose.theta) for pose in planes]
         )
@@ -231,44 +282,96 @@ def read_scans(path: Path) -> list[tuple[Scan, Pose2D]]:
 
 
 def map_scans(mapper: str, scans: Sequence[tuple[Scan, Pose2D]], resolution: float, bounds: Bounds) -> OccupancyGrid:
-    """The map that a mapper makes of scans."""
+    """Map scans with known poses.
+
+    Args:
+        mapper: Name of the mapper.
+        scans: Scans and the laser's poses, map frame.
+        resolution: Side of a cell (m).
+        bounds: Bounds of the map (m).
+
+    Returns:
+        The finished map.
+
+    """
     made = make_mapper(mapper, resolution, bounds)
     for scan, pose in scans:
         made.update(scan, pose)
     return made.finish()
 
 
-def held_in(tile: GridFrame, primitives: Sequence[Primitive]) -> tuple[Primitive, ...]:
-    """The primitives that belong to a tile."""
-    return tuple(one for one in primitives if share_inside(one, tile) >= LEAST_INSIDE)
+def primitives_in_tile(primitives: Sequence[Primitive], tile: GridFrame) -> tuple[Primitive, ...]:
+    """Return the primitives that belong to a tile.
+
+    Args:
+        primitives: Primitives, map frame.
+        tile: The tile's frame.
+
+    Returns:
+        Those with at least MIN_INSIDE_SHARE of their outlines within it.
+
+    """
+    return tuple(primitive for primitive in primitives if share_inside(primitive, tile) >= MIN_INSIDE_SHARE)
 
 
 def share_inside(primitive: Primitive, tile: GridFrame) -> float:
-    """The share of a primitive's outline that lies within a tile."""
+    """Compute the share of an outline within a tile.
+
+    Args:
+        primitive: The primitive, map frame.
+        tile: The tile's frame.
+
+    Returns:
+        The share of the outline's length, 0 to 1.
+
+    """
     import shapely
 
     outline = shapely.LinearRing(primitive.outline())
     return float(outline.intersection(shapely.box(*tile.bounds)).length / outline.length)
 
 
-def yolo_line(primitive: Primitive, tile: GridFrame) -> str:
-    """A primitive's label: class, and its outline's points as shares of the image, cut to the tile.
+def yolo_label(primitive: Primitive, tile: GridFrame) -> str:
+    """Return a primitive's label for ultralytics: a polygon, not a box.
 
-    Points and no box, since training turns images, and a turned box's box is larger than a turned outline's.
+    Training rotates images, and the box around a rotated box is larger than that around the rotated outline.
+
+    Args:
+        primitive: The primitive, map frame.
+        tile: The tile's frame.
+
+    Returns:
+        A line: class index, then x and y of each vertex as shares of the image, clipped to the tile.
+
     """
-    points = np.clip(primitive.outline() / tile.resolution - (tile.col, tile.row), 0, TILE) / TILE
+    points = np.clip(primitive.outline() / tile.resolution - (tile.col, tile.row), 0, TILE_SIZE) / TILE_SIZE
     return " ".join([str(KINDS.index(primitive.kind)), *(f"{value:.6f}" for value in points.ravel())]) + "\n"
 
 
-def box_of(primitive: Primitive, tile: GridFrame) -> tuple[float, float, float, float]:
-    """The box (cells of the tile: left, top, right, bottom; row 0 at the top) around a primitive, cut to the tile."""
+def bounding_box(primitive: Primitive, tile: GridFrame) -> Box:
+    """Return the axis-aligned bounding box of a primitive, clipped to a tile.
+
+    Args:
+        primitive: The primitive, map frame.
+        tile: The tile's frame.
+
+    Returns:
+        Left, top, right, bottom in cells of the tile; row 0 at the top.
+
+    """
     cells = primitive.outline() / tile.resolution - (tile.col, tile.row)
-    (left, top), (right, bottom) = np.clip(cells.min(axis=0), 0, TILE), np.clip(cells.max(axis=0), 0, TILE)
+    (left, top), (right, bottom) = np.clip(cells.min(axis=0), 0, TILE_SIZE), np.clip(cells.max(axis=0), 0, TILE_SIZE)
     return float(left), float(top), float(right), float(bottom)
 
 
 def write_image(path: Path, image: NDArray[np.uint8]) -> None:
-    """Writes a PNG; whole, or not at all."""
+    """Write a PNG image atomically.
+
+    Args:
+        path: Its file.
+        image: (rows, cols, 3).
+
+    """
     from PIL import Image
 
     part = path.with_suffix(f".{os.getpid()}.part")
@@ -276,8 +379,14 @@ def write_image(path: Path, image: NDArray[np.uint8]) -> None:
     part.replace(path)
 
 
-def write_yaml(folder: Path, mapper: str) -> None:
-    """What ultralytics trains from."""
+def write_data_yaml(folder: Path, mapper: str) -> None:
+    """Write the data description that ultralytics trains from.
+
+    Args:
+        folder: Folder of the data set.
+        mapper: Name of the mapper, or of what made the images.
+
+    """
     names = "".join(f"  {k}: {kind.value}\n" for k, kind in enumerate(KINDS))
     text = f"path: {folder.resolve()}\ntrain: images/{mapper}/train\nval: images/{mapper}/val\nnames:\n{names}"
     (folder / f"{mapper}.yaml").write_text(text, encoding="utf-8")
@@ -285,7 +394,15 @@ def write_yaml(folder: Path, mapper: str) -> None:
 
 @dataclass(frozen=True)
 class Sample:
-    """One tile of a set: its image, where it lies, its primitives, and the noise (m) that it was recorded with."""
+    """One tile of a data set.
+
+    Attributes:
+        image: File of its image.
+        frame: Its frame.
+        primitives: The primitives that belong to it, map frame.
+        noise_std: Standard deviation of the range noise (m) that it was recorded with.
+
+    """
 
     image: Path
     frame: GridFrame
@@ -293,16 +410,41 @@ class Sample:
     noise_std: float
 
 
-def samples(folder: Path, mapper: str, split: str) -> list[Sample]:
-    """All tiles of one split, as one mapper maps them. Raises UsageError where the folder holds no such set."""
+def load_samples(folder: Path, mapper: str, split: str) -> list[Sample]:
+    """List the tiles of a data set.
+
+    Args:
+        folder: Folder of the data set.
+        mapper: Name of the mapper whose images are wanted.
+        split: One of SPLITS.
+
+    Returns:
+        The tiles in the order of their names.
+
+    Raises:
+        UsageError: The folder holds no such data set.
+
+    """
     paths = sorted((folder / "truth" / split).glob("*.json"))
     if not paths or not (folder / f"{mapper}.yaml").exists():
         raise UsageError(f"{folder} holds no {split} set for {mapper}: make one with prim-train dataset")
-    return [_sample(folder, mapper, split, path) for path in paths]
+    return [_read_sample(folder, mapper, split, path) for path in paths]
 
 
-def style_of(folder: Path, mapper: str) -> str:
-    """How a set's images show a mapper's cells (networks.tiles.STYLES). Raises UsageError where there is no set."""
+def image_style(folder: Path, mapper: str) -> str:
+    """Return the style of a data set's images.
+
+    Args:
+        folder: Folder of the data set.
+        mapper: Name of the mapper.
+
+    Returns:
+        One of networks.tiles.STYLES.
+
+    Raises:
+        UsageError: The folder holds no data set.
+
+    """
     try:
         manifest = json.loads((folder / "manifest.json").read_text(encoding="utf-8"))
     except (OSError, ValueError) as error:
@@ -310,7 +452,7 @@ def style_of(folder: Path, mapper: str) -> str:
     return "rounded" if mapper in manifest.get("rounded", ()) else "grey"
 
 
-def _sample(folder: Path, mapper: str, split: str, path: Path) -> Sample:
+def _read_sample(folder: Path, mapper: str, split: str, path: Path) -> Sample:
     truth: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
     primitives = tuple(Primitive.from_json(value) for value in truth["primitives"])
     image = folder / "images" / mapper / split / f"{path.stem}.png"
@@ -318,7 +460,7 @@ def _sample(folder: Path, mapper: str, split: str, path: Path) -> Sample:
 
 
 def read_image(sample: Sample) -> NDArray[np.uint8]:
-    """A sample's image (TILE, TILE, 3)."""
+    """Read a sample's image (TILE_SIZE, TILE_SIZE, 3)."""
     from PIL import Image
 
     return np.asarray(Image.open(sample.image))

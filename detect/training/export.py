@@ -1,7 +1,8 @@
-"""Trained networks as ONNX files with a model card, and back: such a file can be trained on. Needs ``[train]``.
+"""Export of trained networks to ONNX with a model card, and import to continue their training. Needs ``[train]``.
 
-An ONNX file holds each convolution with its normalisation folded in. To go on from one, the normalisations are put
-back: from what they see of some images they get the mean and the deviation that leave the network as it is.
+Exporting folds each batch normalisation into its convolution. Importing unfolds them again: each normalisation gets
+the mean and variance of its inputs on some images as its running statistics, and the scale and shift that leave the
+network's outputs unchanged.
 """
 
 from __future__ import annotations
@@ -17,25 +18,37 @@ import numpy as np
 import torch
 
 from detect.networks.parameters import PRESETS
-from detect.networks.tiles import TILE
-from detect.networks.weights import CARD_KEY, Card
+from detect.networks.tiles import TILE_SIZE
+from detect.networks.weights import CARD_KEY, ModelCard
 from detect.training.model import ParameterNetwork
 from prim.errors import UsageError
 from prim.shapes import Kind
 
 OPSET = 17
+"""Version of ONNX's operator set."""
 
-FIXED = ".dfl.conv"
-"""The one convolution of YOLO that is never trained: it adds up what a box's sides may be."""
+FIXED_CONVOLUTION = ".dfl.conv"
+"""Suffix of YOLO's one convolution that is not trained: the expectation over the distribution of a box's sides."""
 
-WORTH_HALVING = 256
-"""Arrays of fewer numbers stay as they are: biases, and constants of the arithmetic."""
+MIN_HALVED_SIZE = 256
+"""Arrays with fewer numbers (biases, arithmetic constants) stay in single precision; set by hand."""
 
 
-def export_cnn(checkpoint: Path, mapper: str, output: Path, about: Mapping[str, Any] | None = None) -> Card:
-    """Makes an ONNX file of a checkpoint of ``prim-train cnn``; crops (N, channels, pixels, pixels), outputs (N, M).
+def export_cnn(checkpoint: Path, mapper: str, output: Path, about: Mapping[str, Any] | None = None) -> ModelCard:
+    """Export a checkpoint of ``prim-train cnn``: crops (N, channels, pixels, pixels) to outputs (N, M).
 
-    Raises UsageError on a file that is no such checkpoint, or one for another mapper's maps; nothing in it is run.
+    Args:
+        checkpoint: The checkpoint; nothing in it is executed.
+        mapper: Name of the mapper whose maps it was trained on.
+        output: The ONNX file to write.
+        about: Further entries of the model card's ``about``.
+
+    Returns:
+        The model card.
+
+    Raises:
+        UsageError: The file is no such checkpoint, or is for another mapper's maps.
+
     """
     network, state = _read_checkpoint(checkpoint)
     if state["mapper"] != mapper:
@@ -43,8 +56,8 @@ def export_cnn(checkpoint: Path, mapper: str, output: Path, about: Mapping[str, 
     network.eval()
     pixels = network.preset.pixels
     kinds = tuple(kind.value for kind in network.kinds)
-    told = {"options": state["options"]} | dict(about or {})
-    card = Card("cnn", mapper, kinds, network.preset.name, network.channels, state["style"], about=told)
+    entries = {"options": state["options"]} | dict(about or {})
+    card = ModelCard("cnn", mapper, kinds, network.preset.name, network.channels, state["style"], about=entries)
     torch.onnx.export(
         network,
         (torch.zeros(2, network.channels, pixels, pixels),),
@@ -55,7 +68,7 @@ def export_cnn(checkpoint: Path, mapper: str, output: Path, about: Mapping[str, 
         opset_version=OPSET,
         dynamo=False,
     )
-    halve(output)
+    store_half_precision(output)
     write_card(output, card)
     return card
 
@@ -67,10 +80,10 @@ def _read_checkpoint(path: Path) -> tuple[ParameterNetwork, dict[str, Any]]:
         kinds = [Kind(kind) for kind in state["kinds"]]
         network = ParameterNetwork(kinds, PRESETS[options["preset"]], options["channels"])
         network.load_state_dict(state["network"])
-        told = {name: state[name] for name in ("options", "mapper", "style")}
-    except Exception as error:  # torch raises many kinds on files that are none of its own
+        facts = {name: state[name] for name in ("options", "mapper", "style")}
+    except Exception as error:  # torch raises exceptions of many types on foreign files
         raise UsageError(f"{path} is no checkpoint of prim-train cnn") from error
-    return network, told
+    return network, facts
 
 
 def export_yolo(
@@ -80,10 +93,23 @@ def export_yolo(
     trust: bool,
     style: str = "grey",
     about: Mapping[str, Any] | None = None,
-) -> Card:
-    """Makes an ONNX file of YOLO weights: images (N, 3, rows, cols), boxes and scores (N, 4 + kinds, anchors).
+) -> ModelCard:
+    """Export YOLO's weights: images (N, 3, rows, cols) to boxes and scores (N, 4 + kinds, anchors).
 
-    The weights are a pickle, which can run code when it is read: raises UsageError unless told to ``trust`` them.
+    Args:
+        weights: Weights of ultralytics: a pickle, which can run code when it is loaded.
+        mapper: Name of the mapper whose maps they were trained on.
+        output: The ONNX file to write.
+        trust: Whether the pickle may be loaded.
+        style: Style of the images (networks.tiles.STYLES).
+        about: The model card's ``about``.
+
+    Returns:
+        The model card, without thresholds.
+
+    Raises:
+        UsageError: The file is not trusted, or not there.
+
     """
     if not trust:
         raise UsageError(f"{weights} is a pickle, which can run code: add --trust if you know where it is from")
@@ -95,40 +121,57 @@ def export_yolo(
     with tempfile.TemporaryDirectory() as folder:
         copy = Path(folder) / weights.name
         shutil.copy(weights, copy)
-        made = YOLO(str(copy)).export(format="onnx", imgsz=TILE, dynamic=True, opset=OPSET, verbose=False)
+        made = YOLO(str(copy)).export(format="onnx", imgsz=TILE_SIZE, dynamic=True, opset=OPSET, verbose=False)
         shutil.move(made, output)
-    halve(output)
-    card = Card("yolo", mapper, style=style, about=dict(about or {}))
+    store_half_precision(output)
+    card = ModelCard("yolo", mapper, style=style, about=dict(about or {}))
     write_card(output, card)
     return card
 
 
-def reopen_yolo(path: Path, images: torch.Tensor, output: Path) -> Path:
-    """Makes weights that ultralytics can train on of a YOLO's ONNX file; ``images`` (N, 3, rows, cols) in 0 to 1.
+def import_yolo(path: Path, images: torch.Tensor, output: Path) -> Path:
+    """Convert an exported YOLO to weights that ultralytics can train; nothing in the file is executed.
 
-    Nothing in the file is run. Raises UsageError on a file that is no such network.
+    Args:
+        path: The ONNX file.
+        images: (N, 3, rows, cols) in 0 to 1, for the statistics of the normalisations.
+        output: The weights to write.
+
+    Returns:
+        ``output``.
+
+    Raises:
+        UsageError: The file is no such network.
+
     """
     from ultralytics.nn.tasks import DetectionModel
 
-    folded = _folded(path)
+    folded = _read_arrays(path)
     model = DetectionModel("yolov5n.yaml", nc=len(Kind), verbose=False)
     try:
         for name, module in model.named_modules():
-            if isinstance(module, torch.nn.Conv2d) and not name.endswith(FIXED):
-                _fill(module, _normalisation(model, name), folded[f"{name}.weight"], folded[f"{name}.bias"])
+            if isinstance(module, torch.nn.Conv2d) and not name.endswith(FIXED_CONVOLUTION):
+                _load_folded(module, _normalisation(model, name), folded[f"{name}.weight"], folded[f"{name}.bias"])
     except (KeyError, RuntimeError) as error:
         raise UsageError(f"{path} is no YOLOv5n of {len(Kind)} kinds") from error
-    _settle(model, images)
+    _set_statistics(model, images)
     torch.save({"model": model, "epoch": -1, "train_args": {}}, output)
     return output
 
 
-def reopen_cnn(path: Path, network: ParameterNetwork, crops: torch.Tensor) -> None:
-    """Fills a network with the weights of an ONNX file of its like; ``crops`` (N, channels, pixels, pixels).
+def import_cnn(path: Path, network: ParameterNetwork, crops: torch.Tensor) -> None:
+    """Load the weights of an exported network; nothing in the file is executed.
 
-    Raises UsageError on a file that is no such network.
+    Args:
+        path: The ONNX file.
+        network: A network of the same preset and kinds, which gets the weights.
+        crops: (N, channels, pixels, pixels) in 0 to 1, for the statistics of the normalisations.
+
+    Raises:
+        UsageError: The file is no such network.
+
     """
-    folded = _folded(path)
+    folded = _read_arrays(path)
     unnamed = [name for name in folded if name.startswith("onnx::Conv")]
     arrays = [folded[name] for name in sorted(unnamed, key=lambda name: int(name.rpartition("_")[2]))]
     convolutions = [module for module in network.features if isinstance(module, torch.nn.Conv2d)]
@@ -136,40 +179,40 @@ def reopen_cnn(path: Path, network: ParameterNetwork, crops: torch.Tensor) -> No
     try:
         pairs = zip(arrays[::2], arrays[1::2], strict=True)
         for module, normalisation, (weight, bias) in zip(convolutions, normalisations, pairs, strict=True):
-            _fill(module, normalisation, weight, bias)
+            _load_folded(module, normalisation, weight, bias)
         network.head.load_state_dict(
             {name.removeprefix("head."): array for name, array in folded.items() if name.startswith("head.")}
         )
     except (RuntimeError, ValueError) as error:
         raise UsageError(f"{path} is no network of this preset and these kinds") from error
-    _settle(network, crops)
+    _set_statistics(network, crops)
 
 
-def _folded(path: Path) -> dict[str, torch.Tensor]:
-    """An ONNX file's arrays by name, in single precision. Raises UsageError on what is no ONNX file."""
+def _read_arrays(path: Path) -> dict[str, torch.Tensor]:
+    """Return an ONNX file's arrays by name, in single precision; raise UsageError where it is none."""
     import onnx
     from onnx import numpy_helper
 
     try:
         tensors = onnx.load(str(path)).graph.initializer
-    except Exception as error:  # protobuf and onnx raise many kinds
+    except Exception as error:  # protobuf and onnx raise exceptions of many types
         raise UsageError(f"{path} is no ONNX network") from error
     return {
-        one.name.removesuffix(".half"): torch.from_numpy(numpy_helper.to_array(one).astype(np.float32).copy())
-        for one in tensors
-        if numpy_helper.to_array(one).dtype in (np.float16, np.float32)
+        tensor.name.removesuffix(".half"): torch.from_numpy(numpy_helper.to_array(tensor).astype(np.float32).copy())
+        for tensor in tensors
+        if numpy_helper.to_array(tensor).dtype in (np.float16, np.float32)
     }
 
 
 def _normalisation(model: torch.nn.Module, name: str) -> torch.nn.BatchNorm2d | None:
-    """The normalisation that stands beside a convolution; None where there is none."""
+    """Return the batch normalisation after a convolution; None where there is none."""
     return getattr(model.get_submodule(name.rpartition(".")[0]), "bn", None) if name.endswith(".conv") else None
 
 
-def _fill(
+def _load_folded(
     module: torch.nn.Conv2d, normalisation: torch.nn.BatchNorm2d | None, weight: torch.Tensor, bias: torch.Tensor
 ) -> None:
-    """Puts folded weights into a convolution; its normalisation then adds the bias, and changes nothing else."""
+    """Load folded weights into a convolution; its normalisation adds the bias and is else the identity."""
     module.weight.data.copy_(weight)
     if normalisation is None:
         assert module.bias is not None
@@ -183,19 +226,19 @@ def _fill(
     normalisation.running_var.fill_(1.0 - normalisation.eps)
 
 
-def _settle(model: torch.nn.Module, images: torch.Tensor) -> None:
-    """Gives normalisations that only add a bias the mean and deviation of what they see: outputs stay the same."""
+def _set_statistics(model: torch.nn.Module, images: torch.Tensor) -> None:
+    """Set running statistics of normalisations that only add a bias to those of their inputs; keep the outputs."""
 
-    def settle(module: torch.nn.BatchNorm2d, inputs: tuple[torch.Tensor]) -> None:
-        seen = inputs[0].detach()
-        mean, variance = seen.mean(dim=(0, 2, 3)), seen.var(dim=(0, 2, 3))
+    def set_statistics(module: torch.nn.BatchNorm2d, inputs: tuple[torch.Tensor]) -> None:
+        features = inputs[0].detach()
+        mean, variance = features.mean(dim=(0, 2, 3)), features.var(dim=(0, 2, 3))
         module.running_mean.copy_(mean)
         module.running_var.copy_(variance)
         module.weight.data.copy_(torch.sqrt(variance + module.eps))
         module.bias.data.add_(mean)
 
     hooks = [
-        module.register_forward_pre_hook(settle)
+        module.register_forward_pre_hook(set_statistics)
         for module in model.modules()
         if isinstance(module, torch.nn.BatchNorm2d)
     ]
@@ -206,31 +249,37 @@ def _settle(model: torch.nn.Module, images: torch.Tensor) -> None:
         hook.remove()
 
 
-def halve(path: Path) -> None:
-    """Keeps a network's weights in half precision: half the file, and as fast, since loading it widens them.
+def store_half_precision(path: Path) -> None:
+    """Store a network's weights in half precision, which halves the file; they are cast to single when it is loaded.
 
-    (A network that also computes in half precision is slower on a CPU: see docs/detect.md.)
+    Arithmetic in half precision is hardly faster on a CPU: see docs/detect.md.
     """
     import onnx
     from onnx import TensorProto, helper, numpy_helper
 
     model = onnx.load(str(path))
     graph = model.graph
-    widened = []
+    casts = []
     for tensor in list(graph.initializer):
         values = numpy_helper.to_array(tensor)
-        if tensor.data_type == TensorProto.FLOAT and values.size >= WORTH_HALVING:
+        if tensor.data_type == TensorProto.FLOAT and values.size >= MIN_HALVED_SIZE:
             graph.initializer.remove(tensor)
             graph.initializer.append(numpy_helper.from_array(values.astype(np.float16), tensor.name + ".half"))
-            widened.append(helper.make_node("Cast", [tensor.name + ".half"], [tensor.name], to=TensorProto.FLOAT))
-    nodes = [*widened, *graph.node]
+            casts.append(helper.make_node("Cast", [tensor.name + ".half"], [tensor.name], to=TensorProto.FLOAT))
+    nodes = [*casts, *graph.node]
     del graph.node[:]
     graph.node.extend(nodes)
     onnx.save(model, str(path))
 
 
-def write_card(path: Path, card: Card) -> None:
-    """Puts a card into an ONNX file's metadata, in the place of all that an exporter says of its machine."""
+def write_card(path: Path, card: ModelCard) -> None:
+    """Store a model card in an ONNX file's metadata, and remove what the exporter wrote about its environment.
+
+    Args:
+        path: The file.
+        card: The model card.
+
+    """
     import onnx
 
     model = onnx.load(str(path))

@@ -1,7 +1,7 @@
-"""From a set to a folder of weights: the steps that the paper's suite and the shipped weights share.
+"""From a data set to a folder of weights: the steps shared by the paper's suite and the shipped weights.
 
-FOLDER/yolo/  FOLDER/cnn.MAPPER[.KIND].pt     training, which an interrupted run goes on with
-FOLDER/yolo.onnx  FOLDER/cnn*.onnx            what it ends with: see detect.networks.weights.load_set
+FOLDER/yolo/  FOLDER/cnn.MAPPER[.KIND].pt     training, which an interrupted run continues
+FOLDER/yolo.onnx  FOLDER/cnn*.onnx            the result: see detect.networks.weights.load_weight_set
 """
 
 from __future__ import annotations
@@ -13,111 +13,170 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from detect.evaluation.evaluate import choose_thresholds
-from detect.networks.weights import DETECTOR, load_weights
+from detect.networks.weights import DETECTOR_FILE, load_weights
 from detect.networks.yolo import Yolo
-from detect.training.dataset import PRESETS, SetOptions, make, samples, style_of
-from detect.training.drawings import NAME, DrawingOptions, make_drawings
+from detect.training.dataset import DATASET_PRESETS, DatasetOptions, image_style, load_samples, make_dataset
+from detect.training.drawings import DRAWINGS, DrawingOptions, make_drawings
+from detect.training.thresholds import choose_thresholds
 from prim.shapes import Kind
 
-MIXED, LARGE = PRESETS["mixed"], PRESETS["large"]
-"""What the first mapper's networks are trained on; and what each mapper's go on with from there."""
+MIXED, LARGE = DATASET_PRESETS["mixed"], DATASET_PRESETS["large"]
+"""The data set that the first mapper's networks are trained on; and the one that each mapper's training is continued
+on."""
 
-WORTH_SAYING = 5.0
-"""What takes no longer than this (s) was there already."""
+MIN_REPORTED_TIME = 5.0
+"""Steps that take no longer (s) found their results there already and are not reported."""
 
-FIRST = "forward"
-"""The mapper whose networks are trained first: its maps show most."""
+FIRST_MAPPER = "forward"
+"""The mapper whose networks are trained first: its maps hold most information."""
 
-Say = Callable[[str], None]
+Announce = Callable[[str], None]
+"""Called with lines of progress."""
 
 
 @contextmanager
-def timed(what: str, say: Say) -> Iterator[None]:
-    """Says how long a part took, where it took a while."""
+def announce_duration(step: str, announce: Announce) -> Iterator[None]:
+    """Report how long a step took, unless it took no longer than MIN_REPORTED_TIME.
+
+    Args:
+        step: Name of the step.
+        announce: Called with the report.
+
+    Yields:
+        Once, for the step to run.
+
+    """
     began = time.monotonic()
     yield
-    took = time.monotonic() - began
-    if took > WORTH_SAYING:
-        say(f"{what}: {took / 60:.1f} min")
+    duration = time.monotonic() - began
+    if duration > MIN_REPORTED_TIME:
+        announce(f"{step}: {duration / 60:.1f} min")
 
 
-def make_start(work: Path, say: Say) -> Path:
-    """YOLO's weights after some epochs on drawings, where COCO's would stand: ``work/start``."""
+def pretrain_yolo(work: Path, announce: Announce) -> Path:
+    """Train YOLO on drawings, in place of COCO's weights.
+
+    Args:
+        work: Folder of the whole training; drawings and run are kept in it.
+        announce: Called with lines of progress.
+
+    Returns:
+        The weights.
+
+    """
     from detect.training.train import YOLO_PRESETS, train_yolo
 
-    with timed("drawings", say):
-        make_drawings(work / NAME, DrawingOptions())
-    with timed("YOLO on drawings", say):
-        return train_yolo(work / NAME, NAME, work / "start", YOLO_PRESETS[NAME])
+    with announce_duration("drawings", announce):
+        make_drawings(work / DRAWINGS, DrawingOptions())
+    with announce_duration("YOLO on drawings", announce):
+        return train_yolo(work / DRAWINGS, DRAWINGS, work / "start", YOLO_PRESETS[DRAWINGS])
 
 
-def make_set(folder: Path, options: SetOptions, say: Say) -> Path:
-    """A set in a folder of its own."""
-    with timed(f"{folder.name}: {sum(options.sizes)} sessions", say):
-        make(folder, options)
+def ensure_dataset(folder: Path, options: DatasetOptions, announce: Announce) -> Path:
+    """Make what is missing of a data set.
+
+    Args:
+        folder: Its folder.
+        options: Its contents.
+        announce: Called with lines of progress.
+
+    Returns:
+        ``folder``.
+
+    """
+    with announce_duration(f"{folder.name}: {sum(options.sizes)} sessions", announce):
+        make_dataset(folder, options)
     return folder
 
 
-def make_weights(
+def train_weights(
     data: Path,
     mapper: str,
     folder: Path,
     preset: str,
     start: Path,
-    say: Say,
+    announce: Announce,
     about: Mapping[str, Any] | None = None,
     cnn_start: Path | None = None,
 ) -> Path:
-    """Trains all networks on a set, with thresholds from its validation split; what is there is not made again.
+    """Train all networks on a data set and export them, with thresholds from its validation split.
 
-    ``start`` is what YOLO begins from, ``cnn_start`` the checkpoint that our one CNN begins from, or None.
+    Args:
+        data: Folder of the data set.
+        mapper: Name of the mapper whose images are used.
+        folder: Where the weights go; if they are there, nothing is done.
+        preset: Name of the training presets (train.YOLO_PRESETS, train.CNN_PRESETS).
+        start: Weights that YOLO's training starts from.
+        announce: Called with lines of progress.
+        about: Entries of the model cards' ``about``.
+        cnn_start: Checkpoint that the training of the one parameter network starts from; None: at random.
+
+    Returns:
+        ``folder``.
+
     """
-    if (folder / DETECTOR).exists():
+    if (folder / DETECTOR_FILE).exists():
         return folder
     from detect.training.export import export_cnn, export_yolo
-    from detect.training.train import CNN_PRESETS, YOLO_PRESETS, checkpoint_name, networks_of, train_cnn, train_yolo
+    from detect.training.train import CNN_PRESETS, YOLO_PRESETS, checkpoint_name, network_kinds, train_cnn, train_yolo
 
     folder.mkdir(parents=True, exist_ok=True)
-    style = style_of(data, mapper)
-    with timed(f"{folder.name}: YOLO", say):
+    style = image_style(data, mapper)
+    with announce_duration(f"{folder.name}: YOLO", announce):
         options = replace(YOLO_PRESETS[preset], start=start, trust=True)
         best = train_yolo(data, mapper, folder / "yolo", options)
-    for kinds in networks_of(preset, list(Kind)):
+    for kinds in network_kinds(preset, list(Kind)):
         name = "cnn" if len(kinds) == len(Kind) else f"cnn.{'-'.join(kinds)}"
         checkpoint = folder / checkpoint_name(mapper, kinds)
-        with timed(f"{folder.name}: {name}", say):
+        with announce_duration(f"{folder.name}: {name}", announce):
             train_cnn(data, mapper, kinds, checkpoint, replace(CNN_PRESETS[preset], start=cnn_start))
         export_cnn(checkpoint, mapper, folder / f"{name}.onnx", about)
     part = folder / "yolo.part"
     export_yolo(best, mapper, part, True, style, about)
-    put_thresholds(part, data)
-    part.replace(folder / DETECTOR)
+    store_thresholds(part, data)
+    part.replace(folder / DETECTOR_FILE)
     return folder
 
 
-def put_thresholds(yolo: Path, data: Path) -> None:
-    """Chooses a YOLO's thresholds on a set's validation split and puts them into its card."""
+def store_thresholds(yolo: Path, data: Path) -> None:
+    """Choose a YOLO's score thresholds and store them in its model card.
+
+    Args:
+        yolo: The network's ONNX file.
+        data: Folder of a data set; its validation split is used.
+
+    """
     from detect.training.export import write_card
 
     weights = load_weights(yolo, "yolo")
-    chosen = choose_thresholds(Yolo(weights), samples(data, weights.card.mapper, "val"))
+    chosen = choose_thresholds(Yolo(weights), load_samples(data, weights.card.mapper, "val"))
     write_card(yolo, replace(weights.card, thresholds=chosen))
 
 
-def make_all(work: Path, mappers: Sequence[str], say: Say) -> Iterator[Path]:
-    """The weights that come with prim, each mapper's in a folder of its own.
+def train_all(work: Path, mappers: Sequence[str], announce: Announce) -> Iterator[Path]:
+    """Train the weights that come with prim.
 
-    FIRST's networks begin from drawings; each mapper's go on from these with more sessions, as all maps look alike.
+    The networks of FIRST_MAPPER are trained from drawings; those of each mapper continue from these on more sessions,
+    since all maps look alike.
+
+    Args:
+        work: Folder of data sets, training and weights.
+        mappers: Names of the mappers.
+        announce: Called with lines of progress.
+
+    Yields:
+        The folder of each mapper's weights.
+
     """
-    start, mixed = make_start(work, say), make_set(work / "mixed", MIXED, say)
-    first = make_weights(mixed, FIRST, work / "first", "prim", start, say, origin(MIXED))
-    yolo, cnn = first / "yolo" / "weights" / "best.pt", first / f"cnn.{FIRST}.pt"
-    large = make_set(work / "large", LARGE, say)
+    start, mixed = pretrain_yolo(work, announce), ensure_dataset(work / "mixed", MIXED, announce)
+    first = train_weights(mixed, FIRST_MAPPER, work / "first", "prim", start, announce, provenance(MIXED))
+    yolo, cnn = first / "yolo" / "weights" / "best.pt", first / f"cnn.{FIRST_MAPPER}.pt"
+    large = ensure_dataset(work / "large", LARGE, announce)
     for mapper in mappers:
-        yield make_weights(large, mapper, work / "weights" / mapper, "more", yolo, say, origin(LARGE), cnn)
+        folder = work / "weights" / mapper
+        yield train_weights(large, mapper, folder, "more", yolo, announce, provenance(LARGE), cnn)
 
 
-def origin(options: SetOptions) -> dict[str, Any]:
-    """What a card tells of the set that a network was trained on."""
+def provenance(options: DatasetOptions) -> dict[str, Any]:
+    """Return a model card's entries about the data set that a network was trained on."""
     return {"sessions": options.sizes[0], "seed": options.seed, "noise_std_m": options.noise_stds}

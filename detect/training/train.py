@@ -1,6 +1,6 @@
-"""Training: YOLOv5 through ultralytics, and the networks of detect.training.model; checkpoints, resumable.
+"""Training of YOLOv5 with ultralytics and of the parameter networks (detect.training.model), with checkpoints.
 
-Needs the extra ``[train]`` (torch, ultralytics). Nothing that replays imports this.
+Needs the extra ``[train]`` (torch, ultralytics); a replay does not import this.
 """
 
 from __future__ import annotations
@@ -17,27 +17,45 @@ from typing import Any
 import numpy as np
 import torch
 
-from detect.networks.parameters import PAPER, PRESETS, PRIM, targets
-from detect.training.crops import Crops, gather
-from detect.training.dataset import read_image, samples, style_of
-from detect.training.export import reopen_cnn, reopen_yolo
+from detect.networks.parameters import PAPER, PRESETS, PRIM, encode_parameters
+from detect.training.crops import CropSamples, collect_crops
+from detect.training.dataset import image_style, load_samples, read_image
+from detect.training.export import import_cnn, import_yolo
 from detect.training.model import ParameterNetwork
 from prim.errors import UsageError
 from prim.shapes import Kind, Primitive
 
-HUBER = 0.1
+HUBER_DELTA = 0.1
+"""Huber's loss is quadratic up to this residual (units of the outputs); set by hand."""
+
 LENGTH_WEIGHT = 10.0
+"""Weight of sizes and offsets in the loss: their unit is as large as the largest primitive; set by hand."""
 
-FINISHED = "finished"
-"""A file of this name says that a run of YOLO's training has come to its end."""
+FINISHED_MARKER = "finished"
+"""Name of the file that marks a finished run of YOLO's training."""
 
-Progress = Callable[[int, int, float, float], None]
-"""Told after each epoch: epochs done, epochs in all, loss on the training and on the validation split."""
+TrainingProgress = Callable[[int, int, float, float], None]
+"""Called after each epoch with the epochs done, all epochs, and the loss on the training and the validation split."""
 
 
 @dataclass(frozen=True)
 class CnnOptions:
-    """How a network is trained: from nothing, or from another's checkpoint. Raises UsageError on what cannot be."""
+    """Training of a parameter network; the fields are keys of checkpoints and model cards.
+
+    Attributes:
+        preset: Name of the encoding (networks.parameters.PRESETS).
+        epochs: Passes over the data set.
+        batch: Crops of one step.
+        learning_rate: Of Adam, at first; decays by a cosine where crops are augmented.
+        channels: Channels of the crops: 1, or 3 that are the same.
+        vary: Whether crops are augmented.
+        seed: Seed of the initial weights and of the augmentation.
+        start: Checkpoint or exported network that training starts from; None: at random.
+
+    Raises:
+        UsageError: The options are impossible.
+
+    """
 
     preset: str = PRIM.name
     epochs: int = 30
@@ -62,17 +80,35 @@ CNN_PRESETS = {
     "more": CnnOptions(epochs=10, learning_rate=0.0005),
     PAPER.name: CnnOptions(PAPER.name, epochs=20, vary=False),
 }
-"""Ours, from nothing and on from there with more sessions; the paper's (IV-B: 20 epochs, batch 128, Adam, learning
-rate 0.001, the crops as they are)."""
+"""``prim`` trains from random weights (set by hand), ``more`` continues on more sessions; ``paper``: IV-B, 20 epochs,
+batch 128, Adam, learning rate 0.001, without augmentation."""
 
 
-def networks_of(preset: str, kinds: Sequence[Kind]) -> list[tuple[Kind, ...]]:
-    """The kinds of each network that a preset trains: the paper's one each, ours one for all."""
+def network_kinds(preset: str, kinds: Sequence[Kind]) -> list[tuple[Kind, ...]]:
+    """Return the kinds of each network of a preset: one for each in the paper's, one for all in the others.
+
+    Args:
+        preset: Name of the encoding (networks.parameters.PRESETS).
+        kinds: All kinds.
+
+    Returns:
+        The kinds of each network.
+
+    """
     return [(kind,) for kind in kinds] if preset == PAPER.name else [tuple(kinds)]
 
 
 def checkpoint_name(mapper: str, kinds: Sequence[Kind]) -> str:
-    """What the checkpoint of a network for some kinds is called."""
+    """Return the file name of a network's checkpoint.
+
+    Args:
+        mapper: Name of the mapper whose maps it is trained on.
+        kinds: Its kinds; they are part of the name where they are not all.
+
+    Returns:
+        The file name.
+
+    """
     return ".".join(["cnn", mapper, *([] if len(kinds) == len(Kind) else ["-".join(kinds)]), "pt"])
 
 
@@ -82,77 +118,90 @@ def train_cnn(
     kinds: Sequence[Kind],
     output: Path,
     options: CnnOptions,
-    progress: Progress | None = None,
+    progress: TrainingProgress | None = None,
 ) -> ParameterNetwork:
-    """Trains a network for some kinds on a set; keeps a checkpoint at ``output`` after each epoch, goes on from one.
+    """Train a network, with a checkpoint after each epoch, or continue from the checkpoint of an interrupted run.
 
-    Raises UsageError where the set holds no primitive of these kinds, or the checkpoint is one of other options.
+    Args:
+        data: Folder of the data set.
+        mapper: Name of the mapper whose images are used.
+        kinds: The kinds, in the order of the outputs.
+        output: The checkpoint's file.
+        options: How it is trained.
+        progress: Called after each epoch.
+
+    Returns:
+        The network, on the CPU, in evaluation mode.
+
+    Raises:
+        UsageError: The data set holds no primitive of these kinds, or the checkpoint has other options.
+
     """
     torch.manual_seed(options.seed)
-    training, validation = (gather(samples(data, mapper, split), kinds) for split in ("train", "val"))
+    training, validation = (collect_crops(load_samples(data, mapper, split), kinds) for split in ("train", "val"))
     if not len(training):
         raise UsageError(f"{data} holds no {' or '.join(kinds)} to learn from")
     network = ParameterNetwork(kinds, PRESETS[options.preset], options.channels)
     if options.start is not None and options.start.suffix == ".onnx":
-        few = [training.exact(i, network.preset) for i in range(min(len(training), options.batch))]
-        reopen_cnn(options.start, network, as_input(few, network.channels))
+        first_batch = [training.plain(i, network.preset) for i in range(min(len(training), options.batch))]
+        import_cnn(options.start, network, stack_crops(first_batch, network.channels))
     elif options.start is not None:
-        network.load_state_dict(_weights_of(options.start, network))
+        network.load_state_dict(_checkpoint_weights(options.start, network))
     network.to(
         "cuda" if torch.cuda.is_available() else "cpu",
-        memory_format=torch.channels_last,  # what convolutions on a CPU are three times faster with
+        memory_format=torch.channels_last,  # convolutions on a CPU are three times faster so
     )
     optimizer = torch.optim.Adam(network.parameters(), lr=options.learning_rate)
     schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, options.epochs)
-    asked = {
+    settings = {
         "options": _plain(asdict(options)),
         "kinds": [kind.value for kind in kinds],
         "mapper": mapper,
-        "style": style_of(data, mapper),
+        "style": image_style(data, mapper),
         "set": json.dumps(_manifest(data)),
     }
-    first = _resume(output, asked, network, optimizer, schedule)
+    first = _resume(output, settings, network, optimizer, schedule)
     for epoch in range(first, options.epochs):
         rng = np.random.default_rng((options.seed, epoch))
-        loss = _epoch(network, optimizer, training, options, rng)
+        loss = _train_epoch(network, optimizer, training, options, rng)
         if options.vary:
             schedule.step()
-        _keep(output, asked, network, optimizer, schedule, epoch + 1)
+        _save_checkpoint(output, settings, network, optimizer, schedule, epoch + 1)
         if progress:
-            progress(epoch + 1, options.epochs, loss, evaluate_cnn(network, validation))
+            progress(epoch + 1, options.epochs, loss, validation_loss(network, validation))
     return network.eval().cpu()
 
 
-def _weights_of(checkpoint: Path, network: ParameterNetwork) -> Any:
-    """Another network's weights. Raises UsageError where it is not of the same make; nothing in the file is run."""
+def _checkpoint_weights(checkpoint: Path, network: ParameterNetwork) -> Any:
+    """Return another network's weights; raise UsageError where kinds or preset differ. Nothing in it is executed."""
     try:
         state = torch.load(checkpoint, weights_only=True, map_location="cpu")
         same = state["kinds"] == [kind.value for kind in network.kinds]
         if same and state["options"]["preset"] == network.preset.name:
             return state["network"]
-    except Exception as error:  # torch raises many kinds on files that are none of its own
+    except Exception as error:  # torch raises exceptions of many types on foreign files
         raise UsageError(f"{checkpoint} is no checkpoint of prim-train cnn") from error
     raise UsageError(f"{checkpoint} is of a network for other kinds, or of another preset")
 
 
-def _epoch(
+def _train_epoch(
     network: ParameterNetwork,
     optimizer: torch.optim.Optimizer,
-    crops: Crops,
+    crops: CropSamples,
     options: CnnOptions,
     rng: np.random.Generator,
 ) -> float:
-    """One pass over all crops in random order; returns the mean loss."""
+    """Train on all crops once, in random order; return the mean loss."""
     network.train()
     preset = network.preset
     order, total = rng.permutation(len(crops)), 0.0
     for begin in range(0, len(order), options.batch):
         chosen = order[begin : begin + options.batch]
-        if len(chosen) < 2:  # batch normalisation needs two
+        if len(chosen) < 2:  # batch normalisation needs at least two
             continue
-        pairs = [crops.varied(i, preset, rng) if options.vary else crops.exact(i, preset) for i in chosen.tolist()]
-        with fast_arithmetic():
-            outputs = network(as_input(pairs, network.channels).to(network.device))
+        pairs = [crops.augmented(i, preset, rng) if options.vary else crops.plain(i, preset) for i in chosen.tolist()]
+        with bfloat16_autocast():
+            outputs = network(stack_crops(pairs, network.channels).to(network.device))
         loss = _loss(network, outputs.float(), [primitive for _, primitive in pairs])
         optimizer.zero_grad()
         loss.backward()
@@ -161,51 +210,71 @@ def _epoch(
     return total / len(order)
 
 
-def evaluate_cnn(network: ParameterNetwork, crops: Crops, batch: int = 256) -> float:
-    """The mean loss over all crops at their true boxes; 0 where there are none."""
+def validation_loss(network: ParameterNetwork, crops: CropSamples, batch: int = 256) -> float:
+    """Compute the mean loss over crops at their true boxes.
+
+    Args:
+        network: The network, which is set to evaluation mode.
+        crops: The crops.
+        batch: Crops of one step.
+
+    Returns:
+        The mean loss; 0 where there are no crops.
+
+    """
     network.eval()
     total = 0.0
     with torch.no_grad():
         for begin in range(0, len(crops), batch):
-            pairs = [crops.exact(i, network.preset) for i in range(begin, min(begin + batch, len(crops)))]
-            outputs = network(as_input(pairs, network.channels).to(network.device))
+            pairs = [crops.plain(i, network.preset) for i in range(begin, min(begin + batch, len(crops)))]
+            outputs = network(stack_crops(pairs, network.channels).to(network.device))
             total += float(_loss(network, outputs, [primitive for _, primitive in pairs])) * len(pairs)
     return total / max(len(crops), 1)
 
 
 def _loss(network: ParameterNetwork, outputs: torch.Tensor, primitives: Sequence[Primitive]) -> torch.Tensor:
-    """How far outputs (N, M) are from the primitives' own, each at its kind's outputs alone.
+    """Compute the loss of outputs (N, M), each primitive's at the outputs of its kind alone.
 
-    The paper's preset: the mean squared error. Ours: Huber's, quadratic up to HUBER; sizes and offsets, whose unit is
-    as large as the largest primitive, count LENGTH_WEIGHT times.
+    The mean squared error with the paper's preset; else Huber's loss, with lengths weighted by LENGTH_WEIGHT.
     """
     preset = network.preset
-    wanted = np.zeros(tuple(outputs.shape), np.float32)
-    weight = np.zeros_like(wanted)
+    target = np.zeros(tuple(outputs.shape), np.float32)
+    weight = np.zeros_like(target)
     for row, primitive in enumerate(primitives):
-        span = preset.span(network.kinds, primitive.kind)
-        wanted[row, span] = targets(primitive, preset)
-        weight[row, span] = 1.0 / preset.outputs(primitive.kind)
-        if preset.vector:
-            weight[row, span.start + preset.lengths(primitive.kind) : span.stop] *= LENGTH_WEIGHT
-    goal = torch.from_numpy(wanted).to(outputs.device)
-    if preset.vector:
-        errors = torch.nn.functional.huber_loss(outputs, goal, reduction="none", delta=HUBER)
+        own = preset.output_slice(network.kinds, primitive.kind)
+        target[row, own] = encode_parameters(primitive, preset)
+        weight[row, own] = 1.0 / preset.output_count(primitive.kind)
+        if preset.angle_as_vector:
+            weight[row, own.start + preset.first_length(primitive.kind) : own.stop] *= LENGTH_WEIGHT
+    goal = torch.from_numpy(target).to(outputs.device)
+    if preset.angle_as_vector:
+        errors = torch.nn.functional.huber_loss(outputs, goal, reduction="none", delta=HUBER_DELTA)
     else:
         errors = torch.nn.functional.mse_loss(outputs, goal, reduction="none")
     return (errors * torch.from_numpy(weight).to(outputs.device)).sum() / len(primitives)
 
 
-def as_input(pairs: Sequence[tuple[Any, Any]], channels: int) -> torch.Tensor:
-    """Crops as the network takes them: (N, channels, pixels, pixels) in 0 to 1."""
-    grey = torch.from_numpy(np.stack([made for made, _ in pairs])).float().div_(255).unsqueeze(1)
+def stack_crops(samples: Sequence[tuple[Any, Any]], channels: int) -> torch.Tensor:
+    """Stack crops into a network's input.
+
+    Args:
+        samples: Crops (pixels, pixels) with their primitives, which are not used.
+        channels: How often each crop is repeated.
+
+    Returns:
+        (N, channels, pixels, pixels) in 0 to 1.
+
+    """
+    grey = torch.from_numpy(np.stack([crop for crop, _ in samples])).float().div_(255).unsqueeze(1)
     return grey.expand(-1, channels, -1, -1).contiguous(memory_format=torch.channels_last)
 
 
-def _keep(output: Path, asked: dict[str, Any], network: Any, optimizer: Any, schedule: Any, epochs: int) -> None:
-    """Writes a checkpoint; whole, or not at all."""
+def _save_checkpoint(
+    output: Path, settings: dict[str, Any], network: Any, optimizer: Any, schedule: Any, epochs: int
+) -> None:
+    """Write a checkpoint atomically."""
     part = output.with_suffix(".part")
-    state = asked | {
+    state = settings | {
         "epochs": epochs,
         "network": network.state_dict(),
         "optimizer": optimizer.state_dict(),
@@ -215,12 +284,12 @@ def _keep(output: Path, asked: dict[str, Any], network: Any, optimizer: Any, sch
     part.replace(output)
 
 
-def _resume(output: Path, asked: dict[str, Any], network: Any, optimizer: Any, schedule: Any) -> int:
-    """Takes over a checkpoint where there is one; returns how many epochs it has seen."""
+def _resume(output: Path, settings: dict[str, Any], network: Any, optimizer: Any, schedule: Any) -> int:
+    """Load a checkpoint where there is one; return how many epochs were trained."""
     if not output.exists():
         return 0
     state = torch.load(output, weights_only=True, map_location="cpu")
-    if {name: state.get(name) for name in asked} != asked:
+    if {name: state.get(name) for name in settings} != settings:
         raise UsageError(f"{output} was trained on another set or with other options: give another file")
     network.load_state_dict(state["network"])
     optimizer.load_state_dict(state["optimizer"])
@@ -230,7 +299,25 @@ def _resume(output: Path, asked: dict[str, Any], network: Any, optimizer: Any, s
 
 @dataclass(frozen=True)
 class YoloOptions:
-    """How YOLOv5 is trained: from its yaml, or from a user's weights (which can run code: say so with ``trust``)."""
+    """Training of YOLOv5 with ultralytics; the fields are keys of the run's ``asked.json``.
+
+    Attributes:
+        model: Architecture, a yaml of ultralytics.
+        start: Weights or exported network that training starts from; None: at random.
+        trust: Whether ``start`` may be a pickle, which can run code.
+        epochs: Passes over the data set.
+        batch: Images of one step.
+        image_size: Side of the images (pixels).
+        optimizer: Name of the optimiser.
+        learning_rate: Its first learning rate.
+        mosaic: Whether images are put together in fours.
+        turn: Whether images are rotated by any angle and flipped upside down.
+        seed: Seed of weights and augmentation.
+
+    Raises:
+        UsageError: ``start`` is a pickle that is not trusted.
+
+    """
 
     model: str = "yolov5n.yaml"
     start: Path | None = None
@@ -257,17 +344,28 @@ YOLO_PRESETS = {
     "paper": YoloOptions(epochs=32, image_size=224, optimizer="SGD", learning_rate=0.01, turn=False),
     "drawings": YoloOptions(epochs=3, mosaic=False, turn=False),
 }
-"""Ours, from drawings and on from there with more sessions; the paper's (IV-B: 32 epochs, batch 32, SGD, learning
-rate 0.01); and one for detect.training.drawings, which vary by themselves."""
+"""``prim`` trains from drawings (set by hand), ``more`` continues on more sessions; ``paper``: IV-B, 32 epochs, batch
+32, SGD, learning rate 0.01; ``drawings`` is for detect.training.drawings, which vary enough without augmentation."""
 
 
 def train_yolo(data: Path, mapper: str, output: Path, options: YoloOptions) -> Path:
-    """Trains YOLOv5 on a set and leaves its best weights in ``output``; goes on from an interrupted run there.
+    """Train YOLOv5, or continue an interrupted run.
 
-    Images are moved, scaled and mirrored, and put together in fours (``mosaic``), as YOLOv5's own settings have it;
-    with ``turn`` they are turned by any angle as well; they are never coloured: a map has no colours to vary.
+    Images are translated, scaled and flipped by ultralytics' defaults, with ``mosaic`` and ``turn`` on request;
+    colours are not augmented, since a map's channels are no colours.
 
-    Raises UsageError where the set is missing, or ``output`` holds a run of another set or other options.
+    Args:
+        data: Folder of the data set.
+        mapper: Name of the mapper whose images are used.
+        output: Folder of the run.
+        options: How it is trained.
+
+    Returns:
+        The best weights, in ``output``.
+
+    Raises:
+        UsageError: The data set is missing, or ``output`` holds a run with other data or options.
+
     """
     config = data / f"{mapper}.yaml"
     if not config.exists():
@@ -276,33 +374,33 @@ def train_yolo(data: Path, mapper: str, output: Path, options: YoloOptions) -> P
     from ultralytics import YOLO, settings
 
     settings.update({"sync": False})
-    _claim(output, {"mapper": mapper, "set": _manifest(data), "options": _plain(asdict(options))})
+    _claim_folder(output, {"mapper": mapper, "set": _manifest(data), "options": _plain(asdict(options))})
     best, last = (output / "weights" / name for name in ("best.pt", "last.pt"))
     if options.start is not None and options.start.suffix == ".onnx":
-        options = replace(options, start=_reopened(options.start, data, mapper, output / "start.pt"), trust=True)
-    if not (output / FINISHED).exists():
-        with fast_arithmetic():
+        options = replace(options, start=_imported(options.start, data, mapper, output / "start.pt"), trust=True)
+    if not (output / FINISHED_MARKER).exists():
+        with bfloat16_autocast():
             if not last.exists():
-                _fit_yolo(YOLO(options.model), config, output, options)
+                _start_training(YOLO(options.model), config, output, options)
             elif not _is_stripped(last):
                 YOLO(str(last)).train(resume=True, trainer=_trainer())
-        (output / FINISHED).touch()
+        (output / FINISHED_MARKER).touch()
     return best
 
 
-def _reopened(start: Path, data: Path, mapper: str, output: Path) -> Path:
-    """An ONNX file as weights to train on, its normalisations settled on images of the set."""
+def _imported(start: Path, data: Path, mapper: str, output: Path) -> Path:
+    """Convert an exported network to weights to train, with statistics of normalisations from the data set."""
     if output.exists():
         return output
-    few = [read_image(sample) for sample in samples(data, mapper, "train")[: YoloOptions.batch]]
-    images = torch.from_numpy(np.stack(few)).permute(0, 3, 1, 2).float() / 255
-    return reopen_yolo(start, images, output)
+    first_batch = [read_image(sample) for sample in load_samples(data, mapper, "train")[: YoloOptions.batch]]
+    images = torch.from_numpy(np.stack(first_batch)).permute(0, 3, 1, 2).float() / 255
+    return import_yolo(start, images, output)
 
 
-def _claim(output: Path, asked: dict[str, Any]) -> None:
-    """Writes what a run was asked for beside it. Raises UsageError where it was asked for something else before."""
+def _claim_folder(output: Path, settings: dict[str, Any]) -> None:
+    """Write a run's settings into its folder; raise UsageError where it holds a run with others."""
     path = output / "asked.json"
-    text = json.dumps(asked, indent=1) + "\n"
+    text = json.dumps(settings, indent=1) + "\n"
     if path.exists() and path.read_text(encoding="utf-8") != text:
         raise UsageError(f"{output} was trained on another set or with other options: give another folder")
     output.mkdir(parents=True, exist_ok=True)
@@ -314,24 +412,24 @@ def _manifest(data: Path) -> Any:
 
 
 def _plain(options: dict[str, Any]) -> dict[str, Any]:
-    """Options as JSON holds them; weights to begin from by their content, wherever they lie."""
+    """Return options as JSON values; the weights to start from as a hash of their content."""
     start = options["start"]
     return options | {"start": start and sha256(Path(start).read_bytes()).hexdigest()}
 
 
 def _is_stripped(checkpoint: Path) -> bool:
-    """Whether a run has come to its end and lost what it could go on with; our own file, read as ultralytics does."""
+    """Return whether a run ended and its checkpoint was stripped of the optimiser; our own file is loaded."""
     return int(torch.load(checkpoint, weights_only=False, map_location="cpu")["epoch"]) < 0
 
 
-def _fit_yolo(model: Any, config: Path, output: Path, options: YoloOptions) -> None:
-    """Runs ultralytics' training from the beginning."""
+def _start_training(model: Any, config: Path, output: Path, options: YoloOptions) -> None:
+    """Start ultralytics' training."""
     turns = {"degrees": 180.0, "flipud": 0.5} if options.turn else {}
     model.train(
         trainer=_trainer(),
         workers=max(2, len(os.sched_getaffinity(0)) - 1),
         cache="ram",
-        amp=False,  # on a GPU, ultralytics tries it out on weights that it downloads
+        amp=False,  # on a GPU, ultralytics checks it with weights that it downloads
         data=str(config),
         epochs=options.epochs,
         batch=options.batch,
@@ -356,7 +454,7 @@ def _fit_yolo(model: Any, config: Path, output: Path, options: YoloOptions) -> N
 
 
 def _trainer() -> type:
-    """Ultralytics' trainer, with images and filters laid out channels last: convolutions on a CPU are faster so."""
+    """Return ultralytics' trainer with tensors in channels-last layout: convolutions on a CPU are faster so."""
     from ultralytics.models.yolo.detect import DetectionTrainer
 
     threads = int(os.environ.get("OMP_NUM_THREADS", len(os.sched_getaffinity(0))))
@@ -375,8 +473,8 @@ def _trainer() -> type:
 
 
 @contextmanager
-def fast_arithmetic() -> Iterator[None]:
-    """Where the processor multiplies bfloat16 matrices itself (AMX), lets torch use it: twice as fast, as good."""
-    able = getattr(torch.cpu, "_is_amx_tile_supported", lambda: False)()
-    with torch.autocast("cpu", dtype=torch.bfloat16, enabled=bool(able)):
+def bfloat16_autocast() -> Iterator[None]:
+    """Let torch compute in bfloat16 where the processor has AMX: twice as fast, no less accurate."""
+    supported = getattr(torch.cpu, "_is_amx_tile_supported", lambda: False)()
+    with torch.autocast("cpu", dtype=torch.bfloat16, enabled=bool(supported)):
         yield

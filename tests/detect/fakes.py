@@ -1,4 +1,4 @@
-"""Networks that give what a test wants, in the place of ONNX Runtime's."""
+"""Fake networks with given outputs, in place of ONNX Runtime's sessions."""
 
 from __future__ import annotations
 
@@ -10,14 +10,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from detect.networks.weights import Card, Weights
+from detect.networks.weights import ModelCard, Weights
 from detect.networks.yolo import KINDS
 
 Answer = Callable[[NDArray[np.float32]], NDArray[np.float32]]
 
 
-class Session:
-    """Answers every batch with a function's arrays."""
+class FakeSession:
+    """A session that computes its outputs by a function."""
 
     def __init__(self, answer: Answer) -> None:
         self.answer = answer
@@ -32,15 +32,15 @@ class Session:
         return [self.answer(batch)]
 
 
-def weights(card: Card, answer: Answer) -> Weights:
-    """Weights whose network answers so."""
-    return Weights(Path("fake.onnx"), card, Session(answer))  # type: ignore[arg-type]
+def weights(card: ModelCard, answer: Answer) -> Weights:
+    """Weights of a network with these outputs."""
+    return Weights(Path("fake.onnx"), card, FakeSession(answer))  # type: ignore[arg-type]
 
 
 def blobs(batch: NDArray[np.float32]) -> NDArray[np.float32]:
-    """A YOLO that knows only solid blobs: one anchor around what is white, of the kind its grey tells; score 0.9.
+    """Outputs of a YOLO that detects one solid blob an image: an anchor around it with score 0.9.
 
-    A blob of grey 1.0 is a square, of 0.9 a rectangle, and so on. A second anchor is the same, scored 0.4.
+    Its grey is its kind: 1.0 is a square, 0.9 a rectangle, and so on. A second anchor is the same with score 0.4.
     """
     output = np.zeros((len(batch), 4 + len(KINDS), 2), np.float32)
     for i, image in enumerate(batch[:, 0]):
@@ -56,7 +56,7 @@ def blobs(batch: NDArray[np.float32]) -> NDArray[np.float32]:
 
 
 def constant(preset: str, kinds: Sequence[str], outputs: Sequence[float]) -> Weights:
-    """A network that reads the same outputs from any crop."""
+    """A parameter network with the same outputs for any crop."""
     return weights(
-        Card("cnn", "det", tuple(kinds), preset, 1), lambda batch: np.tile(np.float32(outputs), (len(batch), 1))
+        ModelCard("cnn", "det", tuple(kinds), preset, 1), lambda batch: np.tile(np.float32(outputs), (len(batch), 1))
     )

@@ -1,4 +1,4 @@
-"""prim-train, as it is called."""
+"""The command line of prim-train."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from detect import cli
-from detect.networks.tiles import TILE
+from detect.networks.tiles import TILE_SIZE
 from detect.networks.weights import SHIPPED, load_weights
 from prim import console
 
@@ -18,7 +18,7 @@ Run = Callable[..., tuple[int, str, str]]
 
 @pytest.fixture
 def run(in_tmp: Path, capsys: pytest.CaptureFixture[str]) -> Run:
-    """Runs prim-train in a folder of its own; exit code, stdout, stderr."""
+    """Run prim-train in a folder of its own; exit code, stdout, stderr."""
 
     def call(*arguments: object) -> tuple[int, str, str]:
         code = console.run(cli.train, "prim-train", [str(argument) for argument in arguments])
@@ -28,7 +28,7 @@ def run(in_tmp: Path, capsys: pytest.CaptureFixture[str]) -> Run:
     return call
 
 
-def test_a_set_is_made_and_gone_on_with(run: Run) -> None:
+def test_a_data_set_is_made_and_continued(run: Run) -> None:
     options = ("--maps", 1, 1, "--noise-std", 0.1, "--mapper", "det", "--kind", "circle", "--seed", 5)
     code, out, err = run("dataset", "set", *options)
     assert (code, err) == (0, "") and out.startswith("made 2 of 2 sessions in set")
@@ -42,6 +42,7 @@ def test_a_set_is_made_and_gone_on_with(run: Run) -> None:
     [
         (["dataset", "a", "--maps", "0", "0"], "at least one session"),
         (["dataset", "a", "--mapper", "magic"], "--mapper"),
+        (["dataset", "a", "--kind", "magic"], "choose from all, square"),
         (["magic"], "magic"),
     ],
 )
@@ -58,7 +59,7 @@ def test_without_torch_the_extra_is_named(run: Run, monkeypatch: pytest.MonkeyPa
 
 
 @pytest.mark.parametrize(("app", "arguments"), [("train", ["all", "w"]), ("evaluation", ["w"])])
-def test_whole_suites_name_the_extra(
+def test_suites_without_torch_name_the_extra(
     in_tmp: Path,
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
@@ -77,13 +78,13 @@ def test_weights_that_can_run_code_must_be_trusted(run: Run) -> None:
 
 
 def test_exported_weights_need_no_trust(run: Run) -> None:
-    """They cannot run code; the set is asked for next."""
+    """They cannot run code; the missing data set is reported next."""
     pytest.importorskip("torch", reason="needs the extra [train]")
     code, _, err = run("yolo", "set", "out", "--start", "a.onnx")
     assert code == 2 and "--trust" not in err and "holds no set" in err
 
 
-def test_a_network_learns_and_goes_on(run: Run) -> None:
+def test_a_network_learns_and_an_ended_run_is_not_repeated(run: Run) -> None:
     pytest.importorskip("torch", reason="needs the extra [train]")
     run("dataset", "set", "--maps", 6, 2, "--mapper", "prob", "--kind", "circle", "--noise-std", 0.0)
     options = ("--mapper", "prob", "--kind", "circle", "--epochs")
@@ -96,8 +97,8 @@ def test_a_network_learns_and_goes_on(run: Run) -> None:
     assert code == 2 and "other options" in err
 
 
-def test_training_begins_where_it_is_told_to(run: Run) -> None:
-    """With steps of next to nothing, what comes out is what went in."""
+def test_training_starts_from_given_weights(run: Run) -> None:
+    """With a learning rate near zero the weights stay."""
     torch = pytest.importorskip("torch", reason="needs the extra [train]")
     from dataclasses import replace
 
@@ -118,22 +119,22 @@ def test_training_begins_where_it_is_told_to(run: Run) -> None:
     code, _, err = run("yolo", "set", "b", "--mapper", "det", "--epochs", 7)
     assert code == 2 and "with other options" in err
 
-    # what is exported gives ultralytics' own boxes and scores, and has thresholds and a card
-    asked = ("export", start, "yolo.onnx", "--stage", "yolo", "--mapper", "det")
-    assert "--set" in run(*asked)[2] and "--trust" in run(*asked, "--set", "set")[2]
-    assert run(*asked, "--set", "set", "--trust")[0] == 0
+    # the exported network has ultralytics' own boxes and scores, thresholds and a model card
+    command = ("export", start, "yolo.onnx", "--stage", "yolo", "--mapper", "det")
+    assert "--set" in run(*command)[2] and "--trust" in run(*command, "--set", "set")[2]
+    assert run(*command, "--set", "set", "--trust")[0] == 0
     exported = load_weights(Path("yolo.onnx"), "yolo", "det")
     assert set(exported.card.thresholds) == {"circle"} and exported.card.style == "rounded"
-    images = np.random.default_rng(0).random((2, 3, TILE, TILE), dtype=np.float32)
+    images = np.random.default_rng(0).random((2, 3, TILE_SIZE, TILE_SIZE), dtype=np.float32)
     model = torch.load(start, weights_only=False)["model"].float().eval()
     with torch.no_grad():
-        wanted = model(torch.from_numpy(images))[0].numpy()
+        expected = model(torch.from_numpy(images))[0].numpy()
     outputs = exported.session.run(None, {"images": images})[0]
-    assert outputs.shape == wanted.shape == (2, 9, 1029)
-    assert outputs[:, :4] == pytest.approx(wanted[:, :4], abs=0.5)  # cells; weights are kept in half precision
-    assert outputs[:, 4:] == pytest.approx(wanted[:, 4:], abs=5e-3)
+    assert outputs.shape == expected.shape == (2, 9, 1029)
+    assert outputs[:, :4] == pytest.approx(expected[:, :4], abs=0.5)  # cells; weights are kept in half precision
+    assert outputs[:, 4:] == pytest.approx(expected[:, 4:], abs=5e-3)
 
-    # and training goes on from shipped ones, without anything in them being run
+    # training continues from shipped weights too, and nothing in them is executed
     start = SHIPPED / "det" / "yolo.onnx"
     code, out, err = run("yolo", "set", "c", "--mapper", "det", "--epochs", 1, "--start", start)
     assert code == 0 and "wrote: c" in out, err

@@ -1,4 +1,4 @@
-"""From maps to primitives, with networks that give what a test wants."""
+"""The detector, with fake networks."""
 
 from __future__ import annotations
 
@@ -7,22 +7,22 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from detect.detector import BATCH, Detector
-from detect.networks.cnn import Estimator
-from detect.networks.tiles import TILE
-from detect.networks.weights import ALL_KINDS, Card, WeightsError
-from detect.networks.yolo import Boxes, Yolo, suppress
+from detect.detector import Detector
+from detect.networks.cnn import ParameterEstimator
+from detect.networks.tiles import TILE_SIZE
+from detect.networks.weights import KIND_NAMES, ModelCard, WeightsError
+from detect.networks.yolo import Boxes, Yolo, non_maximum_suppression
 from mapping.grid import GridFrame, OccupancyGrid
 from prim.errors import UsageError
 from prim.shapes import Kind
 from tests.detect.fakes import blobs, constant, weights
 
 CIRCLE_GREY = 0.8
-"""What the blobs' YOLO takes for a circle."""
+"""Grey that the fake YOLO detects as a circle."""
 
 
 def detector(thresholds: dict[str, float] | None = None) -> Detector:
-    yolo = weights(Card("yolo", "det", thresholds=thresholds or {}), blobs)
+    yolo = weights(ModelCard("yolo", "det", thresholds=thresholds or {}), blobs)
     # every kind: angle 0 (cosine 1, sine 0), offset (0.04, -0.02) m, sizes 0.2 and 0.1 m
     outputs = (
         [1, 0, 0.1, -0.05, 0.5]
@@ -30,11 +30,11 @@ def detector(thresholds: dict[str, float] | None = None) -> Detector:
         + [0.1, -0.05, 0.25]
         + 2 * [1, 0, 0.1, -0.05, 0.5, 0.25]
     )
-    return Detector(yolo, [constant("prim", ALL_KINDS, outputs)])
+    return Detector(yolo, [constant("prim", KIND_NAMES, outputs)])
 
 
 def grid_with(*centres: tuple[float, float], rows: int = 220, cols: int = 220, half: int = 10) -> OccupancyGrid:
-    """A free map whose first cell lies at (0, 0), with solid blobs that stand for circles."""
+    """A free map whose first cell lies at (0, 0), with solid blobs that are detected as circles."""
     probability = np.full((rows, cols), 0.1, np.float32)
     for x, y in centres:
         row, col = round(y * 100), round(x * 100)
@@ -42,17 +42,17 @@ def grid_with(*centres: tuple[float, float], rows: int = 220, cols: int = 220, h
     return OccupancyGrid(GridFrame(0.01, 0, 0, rows, cols), probability)
 
 
-def test_a_blob_becomes_a_primitive_where_it_lies() -> None:
-    found = detector().detect(grid_with((0.7, 1.3)))
-    (one,) = found.found
-    assert one.primitive.kind is Kind.CIRCLE and one.score == pytest.approx(0.9)
-    assert (one.primitive.x, one.primitive.y) == pytest.approx((0.7 + 0.04, 1.3 - 0.02), abs=0.006)
-    assert one.primitive.size == pytest.approx((0.1,))
-    assert one.crop.shape == (72, 72)
+def test_a_blob_is_detected_where_it_lies() -> None:
+    (detection,) = detector().detect(grid_with((0.7, 1.3))).found
+    primitive = detection.primitive
+    assert primitive.kind is Kind.CIRCLE and detection.score == pytest.approx(0.9)
+    assert (primitive.x, primitive.y) == pytest.approx((0.7 + 0.04, 1.3 - 0.02), abs=0.006)
+    assert primitive.size == pytest.approx((0.1,))
+    assert detection.crop.shape == (72, 72)
 
 
-def test_what_scores_too_little_is_kept_for_the_rays() -> None:
-    """The best of its place alone, measured, with its rejection; what was found leaves no doubt beside it."""
+def test_candidates_below_the_threshold_are_doubtful() -> None:
+    """The best of overlapping ones, with parameters and rejection; none beside a detection."""
     found = detector({"circle": 0.95}).detect(grid_with((0.7, 1.3)))
     ((doubtful, rejection),) = found.doubtful
     assert doubtful.score == pytest.approx(0.9) and rejection in found.rejected
@@ -60,7 +60,7 @@ def test_what_scores_too_little_is_kept_for_the_rays() -> None:
     assert detector({"circle": 0.3}).detect(grid_with((0.7, 1.3))).doubtful == ()
 
 
-def test_every_rejected_candidate_says_by_which_threshold() -> None:
+def test_rejections_name_the_failed_test() -> None:
     found = detector({"circle": 0.95}).detect(grid_with((0.7, 1.3)))
     assert not found.found
     low, lower = found.rejected
@@ -70,8 +70,8 @@ def test_every_rejected_candidate_says_by_which_threshold() -> None:
     assert double.reason == "overlaps a better circle by more than 0.45 (IoU)"
 
 
-def test_what_is_rejected_suppresses_nothing() -> None:
-    """A circle below its threshold lies on an ellipse above its own: the ellipse is found."""
+def test_rejected_candidates_suppress_nothing() -> None:
+    """A circle below its threshold overlaps an ellipse above its own: the ellipse is detected."""
 
     def answer(batch: np.ndarray) -> np.ndarray:
         output = np.zeros((len(batch), 9, 2), np.float32)
@@ -80,35 +80,35 @@ def test_what_is_rejected_suppresses_nothing() -> None:
         return output
 
     made = detector()
-    made.yolo = Yolo(weights(Card("yolo", "det"), answer))
+    made.yolo = Yolo(weights(ModelCard("yolo", "det"), answer))
     made.thresholds |= {Kind.CIRCLE: 0.6, Kind.ELLIPSE: 0.3}
     found = made.detect(grid_with((0.7, 1.3)))
-    assert [one.primitive.kind for one in found.found] == [Kind.ELLIPSE]
-    assert [one.reason[:10] for one in found.rejected] == ["score 0.55"]
+    assert [detection.primitive.kind for detection in found.found] == [Kind.ELLIPSE]
+    assert [rejection.reason[:10] for rejection in found.rejected] == ["score 0.55"]
 
 
-def test_one_primitive_on_the_seam_of_tiles_is_found_once() -> None:
-    """The map takes two tiles that share 64 cells: what lies there is seen by both."""
-    rows, cols = TILE, 2 * TILE - 64
+def test_a_primitive_in_two_tiles_is_detected_once() -> None:
+    """The map has several tiles, which overlap."""
+    rows, cols = TILE_SIZE, 2 * TILE_SIZE - 64
     for x in (1.7, 1.92, 1.62, 2.2):
         found = detector().detect(grid_with((x, 1.0), rows=rows, cols=cols))
         assert len(found.found) == 1
         assert found.found[0].primitive.x == pytest.approx(x + 0.04, abs=0.006)
 
 
-def test_a_large_map_goes_through_in_batches() -> None:
+def test_a_large_map_is_processed_in_batches() -> None:
     made = detector()
     centres = [(x, y) for x in np.arange(0.5, 11.5, 2.2) for y in np.arange(0.5, 8.5, 2.2)]
     session = made.yolo.weights.session
     session.batches.clear()  # type: ignore[attr-defined]
     made.detect(grid_with(*centres, rows=900, cols=1200))
     batches = session.batches  # type: ignore[attr-defined]
-    assert len(batches) > 1 and max(batches) <= BATCH
+    assert len(batches) > 1 and max(batches) <= made.options.batch_size
 
 
 @pytest.mark.parametrize("value", [0.5, 0.1])
-def test_a_map_with_nothing_in_it(value: float) -> None:
-    """All unknown, or all free: nothing is found, and no network runs."""
+def test_no_network_runs_on_an_empty_map(value: float) -> None:
+    """All unknown, or all free."""
     made = detector()
     session = made.yolo.weights.session
     session.batches.clear()  # type: ignore[attr-defined]
@@ -121,13 +121,13 @@ def test_another_resolution_is_refused() -> None:
         detector().detect(OccupancyGrid(GridFrame(0.02, 0, 0, 9, 9), np.ones((9, 9), np.float32)))
 
 
-def test_networks_that_are_not_what_their_card_says() -> None:
+def test_networks_that_contradict_their_model_card() -> None:
     with pytest.raises(WeightsError, match="no detector"):
-        Yolo(weights(Card("yolo", "det"), lambda batch: np.zeros((len(batch), 84, 10), np.float32)))
+        Yolo(weights(ModelCard("yolo", "det"), lambda batch: np.zeros((len(batch), 84, 10), np.float32)))
     with pytest.raises(WeightsError, match="3 numbers where its card says 5"):
-        Estimator([constant("prim", ["square"], [1, 0, 0.5])])
+        ParameterEstimator([constant("prim", ["square"], [1, 0, 0.5])])
     with pytest.raises(WeightsError, match="unknown preset"):
-        Estimator([constant("magic", ["square"], [1, 0, 0.5])])
+        ParameterEstimator([constant("magic", ["square"], [1, 0, 0.5])])
 
 
 def test_suppression_by_hand() -> None:
@@ -136,9 +136,9 @@ def test_suppression_by_hand() -> None:
         np.array([0, 0, 0, 1]),
         np.array([0.5, 0.9, 0.3, 0.8], np.float32),
     )
-    assert suppress(boxes, 0.5).tolist() == [1, 1, 2, 1]
-    assert suppress(boxes, 0.5, per_kind=True).tolist() == [1, 1, 2, 3]
-    assert suppress(boxes, 0.5, among=np.array([True, False, True, True])).tolist() == [3, -1, 2, 3]
+    assert non_maximum_suppression(boxes, 0.5).tolist() == [1, 1, 2, 1]
+    assert non_maximum_suppression(boxes, 0.5, per_kind=True).tolist() == [1, 1, 2, 3]
+    assert non_maximum_suppression(boxes, 0.5, eligible=np.array([True, False, True, True])).tolist() == [3, -1, 2, 3]
 
 
 @given(st.integers(0, 2**31), st.booleans())
@@ -150,14 +150,12 @@ def test_many_are_suppressed_as_few_are(seed: int, per_kind: bool) -> None:
         rng.integers(0, 3, 60),
         rng.permutation(60).astype(np.float32) / 60,
     )
-    few = suppress(boxes, 0.3, per_kind)
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("detect.networks.yolo.MANY", 10)
-        assert suppress(boxes, 0.3, per_kind).tolist() == few.tolist()
+    expected = non_maximum_suppression(boxes, 0.3, per_kind)
+    assert non_maximum_suppression(boxes, 0.3, per_kind, hash_above=10).tolist() == expected.tolist()
 
 
-def test_two_primitives_are_not_in_one_place() -> None:
-    """Boxes that overlap little, with outlines that cover each other: the better one stays, the other says why."""
+def test_overlapping_outlines_leave_the_better_detection() -> None:
+    """Boxes that overlap little, with outlines that cover each other: the worse one is rejected."""
 
     def answer(batch: np.ndarray) -> np.ndarray:
         output = np.zeros((len(batch), 9, 2), np.float32)
@@ -166,8 +164,8 @@ def test_two_primitives_are_not_in_one_place() -> None:
         return output
 
     made = detector()
-    made.yolo = Yolo(weights(Card("yolo", "det"), answer))
+    made.yolo = Yolo(weights(ModelCard("yolo", "det"), answer))
     found = made.detect(grid_with((0.7, 1.3)))
-    assert [one.score for one in found.found] == [pytest.approx(0.9)]
+    assert [detection.score for detection in found.found] == [pytest.approx(0.9)]
     (covered,) = found.rejected
     assert covered.reason == "its outline covers that of a better circle by more than 0.25 of the smaller one"

@@ -1,4 +1,4 @@
-"""The measures of Table I, on cases that can be counted by hand."""
+"""The metrics of Table I, on cases that can be counted by hand."""
 
 from __future__ import annotations
 
@@ -7,16 +7,18 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from detect.evaluation.box_metrics import Marked, best_confidences, score_boxes
+from detect.evaluation.box_metrics import score_boxes
 from detect.networks.yolo import Boxes
+from detect.training.matches import ScoredBoxes
+from detect.training.thresholds import best_confidences
 
 SQUARE, CIRCLE = 0, 2
 
 
-def marked(
+def scored_boxes(
     candidates: list[tuple[tuple[float, ...], int, float]], truths: list[tuple[tuple[float, ...], int]]
-) -> Marked:
-    return Marked(
+) -> ScoredBoxes:
+    return ScoredBoxes(
         Boxes(
             np.array([box for box, _, _ in candidates], np.float32).reshape(-1, 4),
             np.array([kind for _, kind, _ in candidates], dtype=np.intp),
@@ -30,8 +32,8 @@ def marked(
 A, B, FAR = (0, 0, 10, 10), (20, 20, 40, 40), (100, 100, 110, 110)
 
 
-def test_all_found_is_one() -> None:
-    image = marked([(A, SQUARE, 0.9), (B, CIRCLE, 0.7)], [(A, SQUARE), (B, CIRCLE)])
+def test_perfect_candidates_score_one() -> None:
+    image = scored_boxes([(A, SQUARE, 0.9), (B, CIRCLE, 0.7)], [(A, SQUARE), (B, CIRCLE)])
     scores = score_boxes([image])
     assert set(scores) == {"all", "square", "circle"}
     for row in scores.values():
@@ -39,14 +41,14 @@ def test_all_found_is_one() -> None:
     assert 0.0 < best_confidences([image])["square"] <= 0.9
 
 
-def test_nothing_found_is_nothing_and_nothing_there_is_no_row() -> None:
-    assert score_boxes([marked([(A, SQUARE, 0.9)], [])]) == {}
-    row = score_boxes([marked([], [(A, SQUARE)])])["all"]
+def test_no_candidates_score_zero_and_absent_kinds_have_no_row() -> None:
+    assert score_boxes([scored_boxes([(A, SQUARE, 0.9)], [])]) == {}
+    row = score_boxes([scored_boxes([], [(A, SQUARE)])])["all"]
     assert (row.f1, row.map50, row.map50_95, row.auc) == (0, 0, 0, 0)
 
 
-def test_a_wrong_kind_a_double_and_a_stray_are_no_hits() -> None:
-    image = marked(
+def test_wrong_kinds_duplicates_and_strays_are_false_positives() -> None:
+    image = scored_boxes(
         [(A, SQUARE, 0.9), (A, SQUARE, 0.8), (B, SQUARE, 0.7), (FAR, SQUARE, 0.6)], [(A, SQUARE), (B, CIRCLE)]
     )
     scores = score_boxes([image])
@@ -57,28 +59,28 @@ def test_a_wrong_kind_a_double_and_a_stray_are_no_hits() -> None:
 
 def test_average_precision_by_hand() -> None:
     """Hit, miss, hit of two true boxes: precision 1, 1/2, 2/3 at recall 1/2, 1/2, 1."""
-    image = marked([(A, SQUARE, 0.9), (FAR, SQUARE, 0.8), (B, SQUARE, 0.7)], [(A, SQUARE), (B, SQUARE)])
+    image = scored_boxes([(A, SQUARE, 0.9), (FAR, SQUARE, 0.8), (B, SQUARE, 0.7)], [(A, SQUARE), (B, SQUARE)])
     row = score_boxes([image])["square"]
     assert row.auc == pytest.approx(0.5 * 1 + 0.5 * 2 / 3)
     assert row.map50 == pytest.approx((51 * 1 + 50 * 2 / 3) / 101)
     assert row.f1 == pytest.approx(0.8)
 
 
-def test_a_loose_box_counts_at_low_iou_only() -> None:
-    image = marked([((0, 0, 10, 8), SQUARE, 0.9)], [(A, SQUARE)])  # IoU 0.8
+def test_a_loose_box_is_a_match_at_low_iou_only() -> None:
+    image = scored_boxes([((0, 0, 10, 8), SQUARE, 0.9)], [(A, SQUARE)])  # IoU 0.8
     row = score_boxes([image])["square"]
     assert row.map50 == 1 and row.map50_95 == pytest.approx(0.7)
 
 
-def test_a_better_candidate_takes_the_box_first() -> None:
-    """Two candidates on one true box: the better one hits though the worse overlaps more."""
-    image = marked([((0, 0, 10, 8), SQUARE, 0.9), (A, SQUARE, 0.5)], [(A, SQUARE)])
+def test_the_candidate_with_the_larger_score_is_matched_first() -> None:
+    """Two candidates on one true box: the better one is matched though the worse overlaps more."""
+    image = scored_boxes([((0, 0, 10, 8), SQUARE, 0.9), (A, SQUARE, 0.5)], [(A, SQUARE)])
     assert score_boxes([image])["square"].auc == 1
 
 
 @given(st.lists(st.tuples(st.booleans(), st.floats(0.01, 1)), min_size=1, max_size=30), st.integers(0, 5))
-def test_scores_lie_between_nothing_and_one(found: list[tuple[bool, float]], missed: int) -> None:
-    """Any order of hits and misses: all measures within [0, 1], the envelope hardly below the raw curve."""
+def test_metrics_are_between_zero_and_one(found: list[tuple[bool, float]], missed: int) -> None:
+    """For any order of hits and misses; the interpolated area is hardly below the raw one."""
     candidates, truths = [], []
     for k, (hit, score) in enumerate(found):
         box = (30.0 * k, 0.0, 30.0 * k + 10, 10.0)
@@ -86,7 +88,7 @@ def test_scores_lie_between_nothing_and_one(found: list[tuple[bool, float]], mis
         if hit:
             truths.append((box, SQUARE))
     truths += [((30.0 * k, 50.0, 30.0 * k + 10, 60.0), SQUARE) for k in range(missed + 1)]
-    row = score_boxes([marked(candidates, truths)])["square"]
+    row = score_boxes([scored_boxes(candidates, truths)])["square"]
     for value in (row.f1, row.map50, row.map50_95, row.auc):
         assert 0 <= value <= 1
     assert row.map50 >= row.auc - 0.02

@@ -1,4 +1,4 @@
-"""Networks as files: the same numbers as torch's, and clear errors for files that cannot be used."""
+"""Network files: outputs equal torch's; files that cannot be used are refused with their reason."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from detect.networks.weights import ALL_KINDS, Card, WeightsError, load_set, load_weights
+from detect.networks.weights import KIND_NAMES, ModelCard, WeightsError, load_weight_set, load_weights
 
 
 @pytest.mark.parametrize(
@@ -22,30 +22,30 @@ from detect.networks.weights import ALL_KINDS, Card, WeightsError, load_set, loa
         (b"garbage" * 100, "no ONNX network"),
     ],
 )
-def test_files_that_are_no_networks(tmp_path: Path, content: bytes, said: str) -> None:
+def test_files_without_a_network_are_refused(tmp_path: Path, content: bytes, said: str) -> None:
     path = tmp_path / "w.onnx"
     path.write_bytes(content)
     with pytest.raises(WeightsError, match=said):
         load_weights(path, "cnn")
 
 
-def test_a_missing_file_and_a_folder(tmp_path: Path) -> None:
+def test_a_missing_file_and_a_folder_are_refused(tmp_path: Path) -> None:
     for path in (tmp_path / "none.onnx", tmp_path):
         with pytest.raises(WeightsError, match=str(path)):
             load_weights(path, "yolo")
 
 
-def test_a_card_reads_back() -> None:
-    card = Card("cnn", "prob", ("circle",), "prim", 1, about={"seed": 3})
-    assert Card.from_json(card.to_json()) == card
+def test_a_model_card_is_parsed_from_its_json() -> None:
+    card = ModelCard("cnn", "prob", ("circle",), "prim", 1, about={"seed": 3})
+    assert ModelCard.from_json(card.to_json()) == card
     for text in ("null", "{}", '{"schema": "prim-weights/1"}', '{"schema": "prim-weights/1", "magic": 1}', "[1]"):
         with pytest.raises(ValueError, match=r"."):
-            Card.from_json(text)
+            ModelCard.from_json(text)
 
 
 @pytest.mark.parametrize("preset", ["prim", "paper"])
-@pytest.mark.parametrize("kinds", [("circle",), ("triangle",), ALL_KINDS], ids=["circle", "triangle", "all"])
-def test_an_exported_network_gives_torch_s_numbers(tmp_path: Path, preset: str, kinds: tuple[str, ...]) -> None:
+@pytest.mark.parametrize("kinds", [("circle",), ("triangle",), KIND_NAMES], ids=["circle", "triangle", "all"])
+def test_an_exported_network_has_torchs_outputs(tmp_path: Path, preset: str, kinds: tuple[str, ...]) -> None:
     torch = pytest.importorskip("torch", reason="needs the extra [train]")
     pytest.importorskip("onnx", reason="needs the extra [train]")
     from dataclasses import asdict
@@ -76,9 +76,9 @@ def test_an_exported_network_gives_torch_s_numbers(tmp_path: Path, preset: str, 
     crops = np.random.default_rng(0).random((5, 1, *[PRESETS[preset].pixels] * 2), dtype=np.float32)
     outputs = weights.session.run(None, {"crops": crops})[0]
     with torch.no_grad():
-        wanted = network(torch.from_numpy(crops)).numpy()
-    assert outputs == pytest.approx(wanted, abs=2e-3)  # weights are kept in half precision
-    assert np.corrcoef(outputs.ravel(), wanted.ravel())[0, 1] > 0.999
+        expected = network(torch.from_numpy(crops)).numpy()
+    assert outputs == pytest.approx(expected, abs=2e-3)  # weights are kept in half precision
+    assert np.corrcoef(outputs.ravel(), expected.ravel())[0, 1] > 0.999
     whole = 4 * sum(parameter.numel() for parameter in network.parameters())
     assert (tmp_path / "a.onnx").stat().st_size < 0.6 * whole + 20_000
     with pytest.raises(WeightsError, match="for cnn, not for yolo"):
@@ -87,8 +87,8 @@ def test_an_exported_network_gives_torch_s_numbers(tmp_path: Path, preset: str, 
         load_weights(tmp_path / "a.onnx", "cnn", "det")
 
 
-def tiny(path: Path, card: Card | str) -> None:
-    """A network that gives back what it gets, with a card, or with any text in its place."""
+def write_identity(path: Path, card: ModelCard | str) -> None:
+    """Write the identity as a network with a model card, or with any text in its place."""
     onnx = pytest.importorskip("onnx", reason="needs the extra [train]")
     from onnx import TensorProto, helper
 
@@ -99,14 +99,14 @@ def tiny(path: Path, card: Card | str) -> None:
     onnx.save(model, str(path))
 
 
-YOLO, CNN = Card("yolo", "det"), Card("cnn", "det", preset="prim", channels=1)
+YOLO, CNN = ModelCard("yolo", "det"), ModelCard("cnn", "det", preset="prim", channels=1)
 
 
-def test_a_folder_of_weights(tmp_path: Path) -> None:
-    tiny(tmp_path / "yolo.onnx", YOLO)
-    tiny(tmp_path / "cnn.onnx", CNN)
+def test_a_folder_of_weights_is_loaded(tmp_path: Path) -> None:
+    write_identity(tmp_path / "yolo.onnx", YOLO)
+    write_identity(tmp_path / "cnn.onnx", CNN)
     for path in (tmp_path, tmp_path / "yolo.onnx"):
-        yolo, networks = load_set(path, "det")
+        yolo, networks = load_weight_set(path, "det")
         assert yolo.card == YOLO and [network.card for network in networks] == [CNN]
 
 
@@ -122,12 +122,12 @@ def test_a_folder_of_weights(tmp_path: Path) -> None:
         ([YOLO], "a network for yolo, not for cnn"),
     ],
 )
-def test_folders_that_do_not_fit(tmp_path: Path, others: list[Card], said: str) -> None:
-    tiny(tmp_path / "yolo.onnx", YOLO)
+def test_folders_of_inconsistent_weights_are_refused(tmp_path: Path, others: list[ModelCard], said: str) -> None:
+    write_identity(tmp_path / "yolo.onnx", YOLO)
     for number, card in enumerate(others):
-        tiny(tmp_path / f"cnn.{number}.onnx", card)
+        write_identity(tmp_path / f"cnn.{number}.onnx", card)
     with pytest.raises(WeightsError, match=said):
-        load_set(tmp_path, "det")
+        load_weight_set(tmp_path, "det")
 
 
 @pytest.mark.parametrize(
@@ -145,13 +145,13 @@ def test_folders_that_do_not_fit(tmp_path: Path, others: list[Card], said: str) 
         {"mapper": 3},
     ],
 )
-def test_cards_that_say_what_none_of_ours_says(tmp_path: Path, change: dict[str, object]) -> None:
-    tiny(tmp_path / "a.onnx", json.dumps(json.loads(YOLO.to_json()) | change))
+def test_impossible_model_cards_are_refused(tmp_path: Path, change: dict[str, object]) -> None:
+    write_identity(tmp_path / "a.onnx", json.dumps(json.loads(YOLO.to_json()) | change))
     with pytest.raises(WeightsError, match="has no model card"):
         load_weights(tmp_path / "a.onnx", "yolo")
 
 
-def test_what_is_no_checkpoint_is_not_exported(tmp_path: Path) -> None:
+def test_files_without_a_checkpoint_are_not_exported(tmp_path: Path) -> None:
     pytest.importorskip("torch", reason="needs the extra [train]")
     from detect.training.export import export_cnn, export_yolo
     from prim.errors import UsageError
@@ -164,38 +164,38 @@ def test_what_is_no_checkpoint_is_not_exported(tmp_path: Path) -> None:
         export_yolo(path, "det", tmp_path / "a.onnx", trust=False)
 
 
-def test_an_exported_network_can_be_trained_on(tmp_path: Path) -> None:
-    """Reopened, with normalisations put back, it gives the same numbers; nothing in the file is run."""
+def test_training_of_an_exported_network_can_be_continued(tmp_path: Path) -> None:
+    """Imported, with unfolded normalisations, it has the same outputs; nothing in the file is executed."""
     torch = pytest.importorskip("torch", reason="needs the extra [train]")
     pytest.importorskip("ultralytics", reason="needs the extra [train]")
     from detect.networks.parameters import PRIM
     from detect.networks.weights import SHIPPED
-    from detect.training.export import reopen_cnn, reopen_yolo
+    from detect.training.export import import_cnn, import_yolo
     from detect.training.model import ParameterNetwork
     from prim.errors import UsageError
     from prim.shapes import Kind
 
     torch.manual_seed(0)
-    yolo, (cnn,) = load_set(SHIPPED / "forward")
+    yolo, (cnn,) = load_weight_set(SHIPPED / "forward")
     images = torch.rand(4, 3, 96, 96)
-    opened = torch.load(reopen_yolo(yolo.path, images, tmp_path / "a.pt"), weights_only=False)["model"].float()
+    opened = torch.load(import_yolo(yolo.path, images, tmp_path / "a.pt"), weights_only=False)["model"].float()
     with torch.no_grad():
         again = opened.eval()(images)[0].numpy()
     before = yolo.session.run(None, {"images": images.numpy()})[0]
     assert again == pytest.approx(before, abs=2e-3)
-    seen = opened.train()(images)  # normalisations that fit what they see: training begins where it was left
-    assert all(torch.isfinite(part).all() for part in seen.values() if isinstance(part, torch.Tensor))
+    trained = opened.train()(images)  # the statistics of the normalisations are those of their inputs
+    assert all(torch.isfinite(part).all() for part in trained.values() if isinstance(part, torch.Tensor))
 
     network, crops = ParameterNetwork(list(Kind), PRIM), torch.rand(4, 1, 72, 72)
-    reopen_cnn(cnn.path, network, crops)
+    import_cnn(cnn.path, network, crops)
     with torch.no_grad():
         outputs = network.eval()(crops).numpy()
     assert outputs == pytest.approx(cnn.session.run(None, {"crops": crops.numpy()})[0], abs=1e-4)
 
     with pytest.raises(UsageError, match="no YOLOv5n"):
-        reopen_yolo(cnn.path, images, tmp_path / "b.pt")
+        import_yolo(cnn.path, images, tmp_path / "b.pt")
     with pytest.raises(UsageError, match="no network of this preset"):
-        reopen_cnn(yolo.path, network, crops)
+        import_cnn(yolo.path, network, crops)
     (tmp_path / "junk.onnx").write_bytes(b"junk")
     with pytest.raises(UsageError, match="no ONNX network"):
-        reopen_cnn(tmp_path / "junk.onnx", network, crops)
+        import_cnn(tmp_path / "junk.onnx", network, crops)
