@@ -1,7 +1,7 @@
-"""How the forward map's probabilities of occupancy are calibrated, and how well they hold.
+"""Calibration of the forward map's probabilities of occupancy: the regression, and its reliability.
 
-    python -m bench.calibrate fit          # the coefficients of mapping.forward.calibration, from recorded ones
-    python -m bench.calibrate check        # the reliability curve on other sessions; --update docs/forward.md
+    python -m bench.calibrate fit          # coefficients of mapping.forward.calibration, from recorded sessions
+    python -m bench.calibrate check        # reliability curve on other sessions; --update docs/forward.md
 
 Training seeds begin at 10000, those of the check at 20000; no other benchmark uses them.
 """
@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from bench.maps import NOISE_LEVELS, update
 from bench.sessions import recorded
-from mapping.forward.calibration import CLIP, behind_surface, known
+from mapping.forward.calibration import CALIBRATION, is_known, surface_probability
 from mapping.forward.mapper import ForwardMapper
 from recorder.sensors import Lidar
 from recorder.session import SessionOptions
@@ -29,13 +29,15 @@ from recorder.session import SessionOptions
 FIT_SEED, CHECK_SEED = 10_000, 20_000
 
 KINDS = ((500, (10, 10), 0.01), (360, (6, 7), 0.01), (180, (8, 8), 0.01), (500, (8, 8), 0.02))
-"""Beams, stops (columns, rows) and resolution of the sessions."""
+"""Beams, stops (columns, rows) and resolution (m) of the sessions."""
 
 RIDGE = 0.01
+"""Weight of the ridge penalty on the scaled coefficients."""
 
 BINS = np.array([0.0, 0.01, 0.05, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 0.95, 0.99, 1.0])
 
 Job = tuple[int, float, tuple[int, tuple[int, int], float]]
+"""Seed, standard deviation of the range noise (m), and kind of a session."""
 
 
 def jobs(first_seed: int, sessions: int) -> Iterator[Job]:
@@ -45,10 +47,16 @@ def jobs(first_seed: int, sessions: int) -> Iterator[Job]:
 
 
 def features(job: Job) -> tuple[Job, NDArray[np.float64], NDArray[np.bool_], NDArray[np.float32]]:
-    """Of every cell that is truly occupied or truly free and known: features, truth, probability.
+    """Map a session and compute the regression's features of the cells that are truly occupied or free, and known.
 
-    The cells beside a surface count as free where the noise is smaller than a cell; where it is larger they cannot be
-    told from the surface, and count as neither, as in the map scores.
+    Cells beside a surface count as free where the noise is smaller than a cell; where it is larger they cannot be
+    separated from the surface and count as neither, as in the map scores.
+
+    Args:
+        job: The session.
+
+    Returns:
+        The job; features (N, 12); which cells (N,) are truly occupied; the map's probabilities (N,).
     """
     seed, noise_std, (rays, stops, resolution) = job
     session = recorded(
@@ -57,24 +65,29 @@ def features(job: Job) -> tuple[Job, NDArray[np.float64], NDArray[np.bool_], NDA
     assert session.truth is not None
     mapper = ForwardMapper(resolution, session.frame.bounds, threads=1)
     for scan, pose in session.scans:
-        mapper.keep(scan, pose)
+        mapper.accumulate(scan, pose)
     fit = mapper.fit()
     free = session.truth.crossed if noise_std < resolution else session.truth.free
-    used = (session.truth.occupied | free) & known(fit.certainty, fit.evidence)
-    own, near = (log_odds(array[used]) for array in behind_surface(fit.stopping, fit.certainty, fit.evidence))
+    used = (session.truth.occupied | free) & is_known(fit.certainty, fit.evidence)
+    own, neighbourhood = (
+        log_odds(array[used]) for array in surface_probability(fit.stopping, fit.certainty, fit.evidence)
+    )
     stopping = np.log(fit.stopping[used].astype(np.float64))
     log_noise = math.log(fit.noise.std / resolution)
-    columns = np.column_stack([v * log_noise**k for v in (np.ones_like(own), own, near, stopping) for k in range(3)])
+    columns = np.column_stack(
+        [v * log_noise**k for v in (np.ones_like(own), own, neighbourhood, stopping) for k in range(3)]
+    )
     return job, columns, session.truth.occupied[used], fit.grid().probability[used]
 
 
-def log_odds(chance: NDArray[np.float32]) -> NDArray[np.float64]:
-    p = np.clip(chance.astype(np.float64), CLIP, 1 - CLIP)
+def log_odds(probability: NDArray[np.float32]) -> NDArray[np.float64]:
+    margin = CALIBRATION.probability_margin
+    p = np.clip(probability.astype(np.float64), margin, 1 - margin)
     return np.asarray(np.log(p / (1 - p)))
 
 
 def fit(sessions: int) -> None:
-    """Logistic regression by Newton's method."""
+    """Fit the logistic regression by Newton's method and print its coefficients."""
     with ProcessPoolExecutor(os.cpu_count()) as pool:
         found = list(pool.map(features, jobs(FIT_SEED, sessions)))
     x = np.concatenate([columns for _, columns, _, _ in found])
@@ -91,7 +104,7 @@ def fit(sessions: int) -> None:
 
 
 def check(sessions: int) -> str:
-    """Of the cells that the map gives a probability in each bin, the share that is occupied, per noise level."""
+    """Return a table: per bin of probability and range of noise, the number of cells and the share occupied."""
     with ProcessPoolExecutor(os.cpu_count()) as pool:
         found = list(pool.map(features, jobs(CHECK_SEED, sessions)))
     levels = {"σ ≤ 0.1 m": lambda std: std <= 0.1, "σ ≥ 0.25 m": lambda std: std >= 0.25}

@@ -19,7 +19,7 @@ from typing import Any
 from bench import classical
 from bench.maps import session_of, update
 from detect.detector import Detector
-from detect.networks.tiles import cut, tiles
+from detect.networks.tiles import tile_frames, tile_image
 from mapping.grid import OccupancyGrid
 from mapping.mapper import make_mapper
 from prim.metrics import match_primitives
@@ -78,8 +78,8 @@ def timed(calls: dict[str, Callable[[], Any]], rounds: int = ROUNDS) -> dict[str
 
 def speed(detector: Detector, case: Case, yolo: Path | None) -> list[str]:
     """The table of times for one map."""
-    tile = next(tiles(case.grid.frame))
-    image = cut(case.grid, tile, detector.card.style)
+    tile = next(tile_frames(case.grid.frame))
+    image = tile_image(case.grid, tile, detector.card.style)
     calls: dict[str, Callable[[], Any]] = {
         "**prim**: map to primitives, all networks": lambda: detector.detect(case.grid),
         "prim: YOLO alone": lambda: detector.yolo(image[None], 0.05),

@@ -1,10 +1,10 @@
-"""How fast the forward mapper is, and how well it finds the noise, whatever it begins with.
+"""Speed of the forward mapper, and accuracy of the range noise that it estimates from different initial values.
 
     python -m bench.forward [--rounds 5] [--data ../shared/data] [--update docs/forward.md]
 
 Speed: 100 scans of 500 beams of a recorded world on 200 x 200 cells, from rays to the finished map, on one core and
-on two: the best of all rounds (on a shared machine the rest is what others do), the kernels compiled before. Noise:
-recorded sessions, seeds 0 to 4.
+on two: the best of all rounds (on a shared machine other processes slow down the rest), the kernels compiled before.
+Noise: recorded sessions, seeds 0 to 4.
 """
 
 from __future__ import annotations
@@ -15,10 +15,10 @@ import time
 from pathlib import Path
 
 from bench.maps import session_of, update
-from bench.sessions import Session, posed_scans
+from bench.sessions import Session, scans_with_poses
 from mapping.forward.mapper import ForwardMapper
 from mapping.grid import GridFrame
-from prim.log.mcap import LogReader
+from prim.log import open_log
 from prim.scan import Scan
 from prim.se2 import Pose2D
 
@@ -32,7 +32,7 @@ Posed = list[tuple[Scan, Pose2D]]
 
 
 def workload(noise_std: float) -> Posed:
-    """100 scans of 500 beams: those of seed 0, and as many of them again as are missing."""
+    """Return 100 scans of 500 beams: those of seed 0, repeated as far as needed."""
     scans = session_of(0, noise_std).scans
     return (scans * 2)[:100]
 
@@ -40,7 +40,7 @@ def workload(noise_std: float) -> Posed:
 def finish_seconds(scans: Posed, threads: int) -> float:
     mapper = ForwardMapper(0.01, BOUNDS, threads=threads)
     for scan, pose in scans:
-        mapper.keep(scan, pose)
+        mapper.accumulate(scan, pose)
     began = time.perf_counter()
     mapper.finish()
     return time.perf_counter() - began
@@ -57,7 +57,7 @@ def update_seconds(scans: Posed) -> list[float]:
 
 
 def whole_seconds(scans: Posed, frame: GridFrame) -> tuple[float, float]:
-    """Streaming and finishing a log."""
+    """Return the seconds that streaming a log and finishing its map take."""
     mapper = ForwardMapper(frame.resolution, frame.bounds)
     began = time.perf_counter()
     for scan, pose in scans:
@@ -72,25 +72,25 @@ def speed(rounds: int, data: Path) -> str:
     work = {noise_std: workload(noise_std) for noise_std in SPEED_NOISE}
     finish_seconds(work[0.0], 2)
     update_seconds(work[0.0])
-    one: dict[float, list[float]] = {noise_std: [] for noise_std in work}
-    two: dict[float, list[float]] = {noise_std: [] for noise_std in work}
-    each: dict[float, list[float]] = {noise_std: [] for noise_std in work}
+    single: dict[float, list[float]] = {noise_std: [] for noise_std in work}
+    double: dict[float, list[float]] = {noise_std: [] for noise_std in work}
+    streamed: dict[float, list[float]] = {noise_std: [] for noise_std in work}
     for _ in range(rounds):
         for noise_std, scans in work.items():
-            one[noise_std].append(finish_seconds(scans, 1))
-            two[noise_std].append(finish_seconds(scans, 2))
-            each[noise_std] += update_seconds(scans)
+            single[noise_std].append(finish_seconds(scans, 1))
+            double[noise_std].append(finish_seconds(scans, 2))
+            streamed[noise_std] += update_seconds(scans)
     lines += [
-        f"| 50,000 rays, σ = {noise_std * 1000:g} mm | {min(one[noise_std]):.2f} s | "
-        f"{min(two[noise_std]):.2f} s | {statistics.median(each[noise_std]) * 1e3:.1f} ms | "
-        f"{max(each[noise_std]) * 1e3:.1f} ms |"
+        f"| 50,000 rays, σ = {noise_std * 1000:g} mm | {min(single[noise_std]):.2f} s | "
+        f"{min(double[noise_std]):.2f} s | {statistics.median(streamed[noise_std]) * 1e3:.1f} ms | "
+        f"{max(streamed[noise_std]) * 1e3:.1f} ms |"
         for noise_std in work
     ]
     if (data / "csail.mcap").exists():
         from bench.heldout import frame_of
 
-        with LogReader(data / "csail.mcap") as log:
-            scans = posed_scans(log)
+        with open_log(data / "csail.mcap") as log:
+            scans = scans_with_poses(log)
         frame = frame_of(scans, 0.05)
         found = min((whole_seconds(scans, frame) for _ in range(rounds)), key=sum)
         rays = sum(len(scan.ranges) for scan, _ in scans)
@@ -106,17 +106,17 @@ def noise() -> str:
     lines.append("|---|" + "---|" * (len(STARTS) + 1))
     for noise_std in FOUND_NOISE:
         sessions = [session_of(seed, noise_std) for seed in SEEDS]
-        found = [[found_noise(session, start) for session in sessions] for start in STARTS]
+        found = [[estimated_noise(session, start) for session in sessions] for start in STARTS]
         cells = " | ".join(f"{statistics.median(values) * 1000:.1f} mm" for values in found)
         worst = max(abs(value / noise_std - 1) for values in found for value in values)
         lines.append(f"| {noise_std * 1000:g} mm | {cells} | {worst:.1%} |")
     return "\n".join(lines)
 
 
-def found_noise(session: Session, start: float) -> float:
+def estimated_noise(session: Session, start: float) -> float:
     mapper = ForwardMapper(0.01, session.frame.bounds, start_std=start)
     for scan, pose in session.scans:
-        mapper.keep(scan, pose)
+        mapper.accumulate(scan, pose)
     mapper.finish()
     return mapper.noise_std
 

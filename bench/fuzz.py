@@ -25,7 +25,7 @@ from pathlib import Path
 
 from prim import console
 from recorder.sensors import Lidar
-from recorder.session import SessionOptions, record
+from recorder.session import SessionOptions, record_session
 from replay.cli import app
 
 SECONDS = 20.0
@@ -95,7 +95,7 @@ def fuzz(folder: Path, cuts: int, flips: int, seed: int) -> tuple[Counter[str], 
     """Replays all damaged logs; returns how often each exit code came, and what went wrong."""
     rng = random.Random(seed)
     log = folder / "whole.mcap"
-    record(log, SessionOptions(seed=seed, stops=(5, 5), lidar=Lidar(rays=24)))
+    record_session(log, SessionOptions(seed=seed, stops=(5, 5), lidar=Lidar(rays=24)))
     whole = replay(log, folder)
     assert whole.code == 0, whole.error
     codes: Counter[str] = Counter()

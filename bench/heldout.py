@@ -1,10 +1,10 @@
-"""How well each mapper's map foretells ranges that it has not seen.
+"""How well each mapper's map predicts held-out ranges.
 
     python -m bench.heldout [--data ../shared/data] [--update docs/forward.md]
 
-Every fifth scan is held out. The map of the others is taken for chances to stop a ray, clipped, and the held-out
-ranges are scored under the forward sensor model: log-likelihood per ray, in nats, larger is better. The clip, the
-noise and the share of wild measurements are fitted for each mapper on the scans that it has seen.
+Every fifth scan is held out. The map of the others is taken as stopping probabilities, clipped, and the held-out
+ranges are scored under the forward sensor model: log-likelihood per ray, in nats, larger is better. The clipping, the
+range noise and the outlier share are fitted for each mapper on the scans that its map is made of.
 """
 
 from __future__ import annotations
@@ -19,15 +19,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bench.maps import session_of, update
-from bench.sessions import Session, posed_scans
-from mapping.forward.level import Level, Noise, Rays
+from bench.sessions import Session, scans_with_poses
+from mapping.forward.level import Level, RangeNoise, RayStore
 from mapping.forward.mapper import ForwardMapper
 from mapping.grid import GridFrame
-from mapping.kernels import end_extent
 from mapping.mapper import make_mapper
-from prim.log.mcap import LogReader
+from prim.log import open_log
 from prim.scan import Scan
 from prim.se2 import Pose2D
+from replay.mapping_stage import frame_of_end_points
 
 EVERY = 5
 CLIPS = (1e-5, 1e-4, 1e-3, 1e-2)
@@ -36,69 +36,78 @@ SEEDS = range(5)
 LOGS = (("csail.mcap", 0.05), ("pillars4.mcap", 0.02))
 
 Posed = list[tuple[Scan, Pose2D]]
+"""Scans with the pose of their laser in the map frame."""
 
 
-def rays_of(scans: Posed) -> Rays:
-    rays = Rays()
+def rays_of(scans: Posed) -> RayStore:
+    rays = RayStore()
     for scan, pose in scans:
         rays.add(scan, pose)
     return rays
 
 
 def frame_of(scans: Posed, resolution: float) -> GridFrame:
-    """The frame that holds all hits."""
-    extents = np.array(
-        [
-            end_extent(
-                scan.ranges,
-                scan.directions,
-                (pose.x, pose.y, np.cos(pose.theta), np.sin(pose.theta)),
-                (scan.range_min, scan.range_max),
-                1 / resolution,
-            )
-            for scan, pose in scans
-        ]
-    )
-    row, col = extents[:, :2].min(axis=0).tolist()
-    last_row, last_col = extents[:, 2:].max(axis=0).tolist()
-    return GridFrame(resolution, row, col, last_row - row + 1, last_col - col + 1)
+    """Compute the frame of the end points of all beams; the side of a cell is ``resolution`` (m)."""
+    frame = frame_of_end_points(scans, resolution)
+    assert frame is not None
+    return frame
 
 
-def score(chances: NDArray[np.float32], frame: GridFrame, seen: Rays, unseen: Rays) -> tuple[float, float]:
-    """Log-likelihood per held-out ray and the noise (m), with the clip and the noise that fit the seen rays best."""
+def score(
+    stopping: NDArray[np.float32], frame: GridFrame, training: RayStore, held_out: RayStore
+) -> tuple[float, float]:
+    """Score a map by held-out rays.
+
+    Args:
+        stopping: The map (rows, cols), taken as stopping probabilities.
+        frame: Its frame.
+        training: The rays that the clipping and the noise are fitted to.
+        held_out: The rays that are scored.
+
+    Returns:
+        The mean log-likelihood of a held-out ray (nats), and the standard deviation of the fitted noise (m).
+    """
     best = (-np.inf, 0.0, 0.0)
     for clip in CLIPS:
-        level, noise = Level(frame, 0.5), Noise(0.1, 0.01)
-        level.restore(np.clip(chances, clip, 1 - clip).astype(np.float32))
+        level, noise = Level(frame, 0.5), RangeNoise(0.1, 0.01)
+        level.set_parameters(np.clip(stopping, clip, 1 - clip).astype(np.float32))
         for _ in range(NOISE_PASSES):
-            _, totals = level.expect(seen, noise)
-            noise = totals.noise(noise, frame.resolution)
-        fit = level.expect(seen, noise)[1].per_ray
+            _, statistics = level.expect(training, noise)
+            noise = statistics.range_noise(noise, frame.resolution)
+        fit = level.expect(training, noise)[1].mean_log_likelihood
         if fit > best[0]:
-            best = fit, level.expect(unseen, noise)[1].per_ray, noise.std
+            best = fit, level.expect(held_out, noise)[1].mean_log_likelihood, noise.std
     return best[1], best[2]
 
 
 def compare(scans: Posed, frame: GridFrame) -> dict[str, tuple[float, float]]:
-    """Each mapper's score."""
-    seen = [item for i, item in enumerate(scans) if i % EVERY]
-    unseen = rays_of(scans[::EVERY])
-    chances = {}
+    """Score each mapper's map of four fifths of the scans by the others, see :func:`score`.
+
+    Args:
+        scans: All scans.
+        frame: The maps' frame.
+
+    Returns:
+        Per mapper the mean log-likelihood of a held-out ray (nats) and the noise (m).
+    """
+    training = [item for i, item in enumerate(scans) if i % EVERY]
+    held_out = rays_of(scans[::EVERY])
+    maps = {}
     for name in ("det", "prob"):
         mapper = make_mapper(name, frame.resolution, frame.bounds)
-        for scan, pose in seen:
+        for scan, pose in training:
             mapper.update(scan, pose)
-        chances[name] = mapper.finish().probability
+        maps[name] = mapper.finish().probability
     forward = ForwardMapper(frame.resolution, frame.bounds, threads=1)
-    for scan, pose in seen:
-        forward.keep(scan, pose)
+    for scan, pose in training:
+        forward.accumulate(scan, pose)
     fit = forward.fit()
-    chances["forward, grid()"] = fit.grid().probability
-    chances["forward, its stopping chances"] = fit.stopping
-    return {name: score(array, frame, rays_of(seen), unseen) for name, array in chances.items()}
+    maps["forward, grid()"] = fit.grid().probability
+    maps["forward, its stopping probabilities"] = fit.stopping
+    return {name: score(array, frame, rays_of(training), held_out) for name, array in maps.items()}
 
 
-def of_session(job: tuple[int, float]) -> dict[str, tuple[float, float]]:
+def scores_of_session(job: tuple[int, float]) -> dict[str, tuple[float, float]]:
     session: Session = session_of(*job)
     return compare(session.scans, session.frame)
 
@@ -106,13 +115,13 @@ def of_session(job: tuple[int, float]) -> dict[str, tuple[float, float]]:
 def rows(data: Path) -> Iterator[tuple[str, dict[str, tuple[float, float]]]]:
     with ProcessPoolExecutor(os.cpu_count()) as pool:
         for noise_std in (0.05, 0.25, 0.5):
-            found = list(pool.map(of_session, [(seed, noise_std) for seed in SEEDS]))
+            found = list(pool.map(scores_of_session, [(seed, noise_std) for seed in SEEDS]))
             mean = {name: tuple(np.mean([scores[name] for scores in found], axis=0)) for name in found[0]}
             yield f"sessions, σ = {noise_std * 1000:g} mm (mean of {len(SEEDS)})", mean
     for name, resolution in LOGS:
         if (data / name).exists():
-            with LogReader(data / name) as log:
-                scans = posed_scans(log)
+            with open_log(data / name) as log:
+                scans = scans_with_poses(log)
             yield f"{name}, {resolution} m", compare(scans, frame_of(scans, resolution))
 
 

@@ -21,7 +21,7 @@ MANY_ARGUMENTS = 9
 KNOWS = {
     "a kind": r"Kind\.(SQUARE|RECTANGLE|CIRCLE|TRIANGLE|ELLIPSE)|\"(square|rectangle|circle|triangle|ellipse)\"",
     "a mapper": r"(DeterministicMapper|ProbabilisticMapper|ForwardMapper)\(|\"(det|prob|forward)\"",
-    "a format of logs": r"\bLogReader\(|from mcap|import mcap",
+    "a format of logs": r"\b(Log|Mcap)Reader\(|from mcap|import mcap",
 }
 """What a file holds that knows one of several by its name."""
 

@@ -1,10 +1,10 @@
-"""How good each mapper's maps are, per noise level: recorded sessions, the median of each score.
+"""Scores of each mapper's maps, per noise level: medians over recorded sessions.
 
     python -m bench.maps [--sessions 50] [--update docs/forward.md] [--short README.md]
 
-Seeds 0, 1, ... are the sessions'; a session with another noise level has the same world and the same poses. Beside
-the mappers stand what could be made of prob: the Gaussian sensor model, told the true noise; and its log-odds, put
-right by a logistic regression for each noise level, on sessions of other seeds.
+Sessions have seeds 0, 1, ...; at all noise levels they have the same worlds and poses. Beside the mappers stand two
+variants of prob: with the Gaussian sensor model and the true noise; and with its log-odds calibrated by a logistic
+regression for each noise level, on sessions of other seeds.
 """
 
 from __future__ import annotations
@@ -38,7 +38,15 @@ def session_of(seed: int, noise_std: float) -> Session:
 
 
 def probability(mapper: Mapper, session: Session) -> NDArray[np.float32]:
-    """The map of a session's scans."""
+    """Return the probabilities of occupancy (rows, cols) of a session's scans.
+
+    Args:
+        mapper: An empty mapper.
+        session: The session.
+
+    Returns:
+        The map.
+    """
     for scan, pose in session.scans:
         mapper.update(scan, pose)
     return mapper.finish().probability
@@ -50,7 +58,7 @@ def odds_of(p: NDArray[np.float32]) -> NDArray[np.float64]:
 
 
 def calibration(noise_std: float) -> Line:
-    """Intercept and slope of the logistic regression of truth on prob's log-odds."""
+    """Return intercept and slope of the logistic regression of the truth on prob's log-odds."""
     odds, truth = [], []
     for seed in range(CALIBRATION_SEED, CALIBRATION_SEED + CALIBRATION_SESSIONS):
         session = session_of(seed, noise_std)
@@ -69,7 +77,7 @@ def calibration(noise_std: float) -> Line:
 
 
 def scores_of(job: tuple[int, float, Line]) -> dict[str, Scores]:
-    """Each row's scores of one session."""
+    """Return each row's scores of one session."""
     seed, noise_std, (intercept, slope) = job
     session = session_of(seed, noise_std)
     bounds = session.frame.bounds
@@ -84,14 +92,14 @@ def scores_of(job: tuple[int, float, Line]) -> dict[str, Scores]:
     }
 
 
-def as_columns(one: MapScores, three: MapScores) -> Scores:
+def as_columns(scores: MapScores, within_three: MapScores) -> Scores:
     return (
-        one.occupied_f1,
-        three.occupied_f1,
-        one.occupied_precision,
-        one.occupied_recall,
-        one.free_accuracy,
-        one.auc,
+        scores.occupied_f1,
+        within_three.occupied_f1,
+        scores.occupied_precision,
+        scores.occupied_recall,
+        scores.free_accuracy,
+        scores.auc,
     )
 
 
@@ -101,7 +109,15 @@ def median(values: list[float | None]) -> str:
 
 
 def measure(sessions: int, first_seed: int = 0) -> dict[tuple[float, str], list[str]]:
-    """The medians of each noise level and row."""
+    """Compute the medians of each noise level and row.
+
+    Args:
+        sessions: Number of sessions.
+        first_seed: Seed of the first one.
+
+    Returns:
+        Medians of the columns by noise level and row.
+    """
     medians = {}
     with ProcessPoolExecutor(os.cpu_count()) as pool:
         lines = list(pool.map(calibration, NOISE_LEVELS))
@@ -126,7 +142,13 @@ def table(medians: dict[tuple[float, str], list[str]], rows: tuple[str, ...], co
 
 
 def update(path: Path, name: str, content: str) -> None:
-    """Puts a table between its two marks in a document."""
+    """Replace a table between its two marks in a document.
+
+    Args:
+        path: The document.
+        name: Name of the marks.
+        content: The table.
+    """
     before, _, rest = path.read_text(encoding="utf-8").partition(f"<!-- {name} -->")
     after = rest.partition(f"<!-- /{name} -->")[2]
     path.write_text(f"{before}<!-- {name} -->\n{content}\n<!-- /{name} -->{after}", encoding="utf-8")

@@ -21,19 +21,22 @@ from numpy.typing import NDArray
 
 from bench.detect import timed
 from detect.evaluation.box_metrics import score_boxes
-from detect.evaluation.evaluate import BATCH, Pictured, mark
-from detect.networks.weights import DETECTOR, Weights, load_weights
+from detect.evaluation.evaluate import scored_candidates
+from detect.networks.weights import DETECTOR_FILE, Weights, load_weights
 from detect.networks.yolo import Yolo
-from detect.training.dataset import Sample, read_image, samples
+from detect.training.dataset import Sample, load_samples, read_image
+from detect.training.matches import LabelledImage
 
 CALIBRATION = 100
 """Images that int8's ranges are found from."""
+
+BATCH = 8
 
 Run = Callable[[NDArray[np.float32]], NDArray[np.float32]]
 
 
 def images_of(chosen: Sequence[Sample]) -> NDArray[np.float32]:
-    """Images (N, 3, TILE, TILE) as the network takes them."""
+    """Images (N, 3, TILE_SIZE, TILE_SIZE) as the network takes them."""
     stacked = np.stack([read_image(sample) for sample in chosen]).transpose(0, 3, 1, 2)
     return np.ascontiguousarray(stacked, np.float32) / np.float32(255)
 
@@ -129,10 +132,12 @@ class _Session:
 def accuracy(run: Run, like: Weights, chosen: Sequence[Sample]) -> tuple[float, float, float]:
     """F1, mAP 0.5 and mAP 0.5-0.95."""
     yolo = Yolo(replace(like, session=_Session(run, like)))
-    marked = []
+    scored = []
     for begin in range(0, len(chosen), BATCH):
-        marked += mark(yolo, [Pictured(one, read_image(one)) for one in chosen[begin : begin + BATCH]])
-    row = score_boxes(marked)["all"]
+        scored += scored_candidates(
+            yolo, [LabelledImage(one, read_image(one)) for one in chosen[begin : begin + BATCH]]
+        )
+    row = score_boxes(scored)["all"]
     return row.f1, row.map50, row.map50_95
 
 
@@ -156,11 +161,11 @@ def main() -> None:
     parser.add_argument("weights", type=Path)
     parser.add_argument("set", type=Path)
     options = parser.parse_args()
-    like = load_weights(options.weights / DETECTOR, "yolo")
-    training, chosen = (samples(options.set, like.card.mapper, split) for split in ("train", "val"))
+    like = load_weights(options.weights / DETECTOR_FILE, "yolo")
+    training, chosen = (load_samples(options.set, like.card.mapper, split) for split in ("train", "val"))
     lines = ["| YOLO, one tile | best, ms | median, ms | F1 | mAP 0.5 | mAP 0.5–0.95 |", "|---|" + "---:|" * 5]
     with tempfile.TemporaryDirectory() as folder:
-        ways = runs(options.weights / DETECTOR, Path(folder), training)
+        ways = runs(options.weights / DETECTOR_FILE, Path(folder), training)
         tile = images_of(chosen[:1])
         times = timed({name: lambda run=run: run(tile) for name, run in ways.items()})  # type: ignore[misc]
         for name, run in ways.items():

@@ -28,11 +28,12 @@ from bench.limit import bounds, ratio
 from bench.maps import update
 from bench.sessions import Session, recorded
 from detect.detector import Detector
-from detect.evaluation.box_metrics import Marked, score_boxes
-from detect.evaluation.sessions import marked
+from detect.evaluation.box_metrics import score_boxes
+from detect.evaluation.sessions import scored_primitives
 from detect.networks.weights import SHIPPED
 from detect.refinement.map_cells import is_within
 from detect.refinement.refine import refine_detections
+from detect.training.matches import ScoredBoxes
 from mapping.mapper import make_mapper
 from prim.arrays import FloatArray
 from prim.metrics import match_primitives
@@ -72,7 +73,7 @@ class Outcome:
 
     primitives: tuple[Found, ...]
     detections: int
-    marked: Marked
+    scored: ScoredBoxes
     network: tuple[int, int]
     opencv: tuple[int, int]
     refine_s: float
@@ -83,7 +84,7 @@ def outcome(seed: int, noise_std: float, mapper: str) -> Outcome:
     session = recorded(SessionOptions(seed=seed, lidar=Lidar(noise_std=noise_std)))
     made = make_mapper(mapper, 0.01, session.frame.bounds)
     for scan, pose in session.scans:
-        made.keep(scan, pose)
+        made.accumulate(scan, pose)
     grid = made.finish()
     detector = Detector.load(SHIPPED / mapper, mapper, 1)
     detections = detector.detect(grid)
@@ -126,7 +127,7 @@ def outcome(seed: int, noise_std: float, mapper: str) -> Outcome:
     return Outcome(
         tuple(rows),
         len(primitives),
-        marked(refined, session.primitives),
+        scored_primitives(refined, session.primitives),
         (sum(pair.found for pair in networks), len(detections.found)),
         (len(peers), len(peer)),
         ended - between,
@@ -206,7 +207,7 @@ def quality(name: str, of: Sequence[Outcome]) -> str:
     angles = [row.angle for row in found if row.angle is not None]
     sizes = 1000 * np.array([row.sizes for row in found])
     place = 1000 * np.array([row.place for row in found])
-    scores = score_boxes([one.marked for one in of])["all"]
+    scores = score_boxes([one.scored for one in of])["all"]
     each = [one.refine_s / len(one.primitives) for one in of if one.primitives]
     cells = (
         name,

@@ -27,7 +27,7 @@ import numpy as np
 
 from bench.maps import update
 from mapping.mapper import make_mapper
-from prim.log.mcap import LogReader
+from prim.log import open_log
 from prim.log.messages import (
     ODOM_TOPIC,
     ODOMETRY_TYPE,
@@ -40,7 +40,7 @@ from prim.log.messages import (
 from prim.log.writer import LogWriter
 from prim.scan import Scan
 from prim.se2 import Pose2D
-from recorder.session import SessionOptions, record
+from recorder.session import SessionOptions, record_session
 
 BIN = Path(sys.executable).parent
 SCANS, RAYS = 100, 500
@@ -131,7 +131,7 @@ def reading_rate(log: Path) -> float:
 
     def work() -> None:
         nonlocal count
-        with LogReader(log) as reader:
+        with open_log(log) as reader:
             count = sum(1 for _ in reader.decoded(reader.topics[SCAN_TOPIC], decode_scan))
 
     return 1 / (seconds(work) / count)
@@ -150,10 +150,10 @@ def recording_rate(folder: Path, motion: str, session_seconds: float) -> float:
     """Session seconds per second of recording, within one process."""
     stops = (round(session_seconds * 10 / 20), 20)
     options = SessionOptions(seed=1, motion=motion, stops=stops, duration=session_seconds)
-    session = record(folder / "warm.mcap", SessionOptions(seed=1, stops=(2, 2)))
-    taken = seconds(lambda: record(folder / "r.mcap", options))
+    session = record_session(folder / "warm.mcap", SessionOptions(seed=1, stops=(2, 2)))
+    taken = seconds(lambda: record_session(folder / "r.mcap", options))
     assert session.scans
-    with LogReader(folder / "r.mcap") as log:
+    with open_log(folder / "r.mcap") as log:
         return log.topics[SCAN_TOPIC].messages / 10 / taken
 
 
@@ -163,7 +163,7 @@ def measure(rounds: int, peer: Path | None, folder: Path) -> Rows:
     scans, poses = room()
     long_log(folder / "read.mcap", 10_000, 500)
     session = folder / "s.mcap"
-    record(session, SessionOptions(seed=10))
+    record_session(session, SessionOptions(seed=10))
     replay = BIN / "prim-replay"
     for _ in range(rounds):
         with one_core():

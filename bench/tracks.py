@@ -16,13 +16,12 @@ from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 from bench.maps import update
 from prim.metrics import match_primitives
 from recorder.sensors import Lidar
-from recorder.session import SessionOptions, record
-from replay.detection import Sighting
+from recorder.session import SessionOptions, record_session
+from replay.detection import DetectionResult
 from replay.options import ReplayOptions
 from replay.pipeline import Pipeline
 from replay.viewer_protocol import NullViewer
@@ -30,23 +29,23 @@ from replay.viewer_protocol import NullViewer
 FIRST_SEED = 70_000
 
 
-class Watcher(NullViewer):
-    """Keeps what is shown of primitives."""
+class DetectionCollector(NullViewer):
+    """A viewer that collects all detections."""
 
     def __init__(self) -> None:
-        self.sightings: list[Sighting] = []
+        self.results: list[DetectionResult] = []
 
-    def show_sighting(self, position: int, stamp: int, sighting: Sighting) -> None:
-        """Keeps it."""
-        self.sightings.append(sighting)
+    def show_detections(self, position: int, stamp: int, result: DetectionResult) -> None:
+        """See :meth:`.Viewer.show_detections`."""
+        self.results.append(result)
 
 
-def ids_of(sighting: Sighting) -> dict[int, int]:
-    """The confirmed id of each true primitive that is found where it is."""
-    found = [one.primitive for one in sighting.detections.found]
-    pairs = match_primitives(found, sighting.truth)
-    sure = {pair.truth: sighting.identities[pair.detection] for pair in pairs if pair.iou >= 0.5}
-    return {truth: identity.id for truth, identity in sure.items() if identity.confirmed}
+def confirmed_ids(result: DetectionResult) -> dict[int, int]:
+    """Return the id of each true primitive whose track is confirmed and which it overlaps by half."""
+    found = [detection.primitive for detection in result.detections.found]
+    pairs = match_primitives(found, result.truth)
+    identities = {pair.truth: result.identities[pair.detection] for pair in pairs if pair.iou >= 0.5}
+    return {truth: identity.id for truth, identity in identities.items() if identity.confirmed}
 
 
 def session(seed: int, mapper: str, every: int) -> tuple[int, int, int]:
@@ -54,15 +53,15 @@ def session(seed: int, mapper: str, every: int) -> tuple[int, int, int]:
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "driven.mcap"
         options = SessionOptions(seed=seed, motion="drive", duration=40.0, rate=5.0, lidar=Lidar(noise_std=0.05))
-        record(path, options)
-        watcher: Any = Watcher()
-        Pipeline(path, ReplayOptions(mapper=mapper, detect_every=every), watcher).run()
+        record_session(path, options)
+        collector = DetectionCollector()
+        Pipeline(path, ReplayOptions(mapper=mapper, detect_every=every), collector).run()
     first: dict[int, int] = {}
     kept: dict[int, bool] = {}
-    for sighting in watcher.sightings:
-        for truth, identity in ids_of(sighting).items():
+    for result in collector.results:
+        for truth, identity in confirmed_ids(result).items():
             kept[truth] = kept.get(truth, True) and first.setdefault(truth, identity) == identity
-    last = watcher.sightings[-1]
+    last = collector.results[-1]
     there = {pair.detection for pair in match_primitives([one.primitive for one in last.detections.found], last.truth)
              if pair.iou >= 0.5}  # fmt: skip
     false = sum(one.confirmed for k, one in enumerate(last.identities) if k not in there)

@@ -1,1 +1,1 @@
-"""From scans and poses to occupancy grids."""
+"""Mapping: from scans at known poses to occupancy grids."""

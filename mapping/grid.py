@@ -1,4 +1,4 @@
-"""The one grid type: probabilities of occupancy on cells that lie on whole multiples of the resolution."""
+"""Occupancy grids: probabilities of occupancy on cells that lie on whole multiples of the resolution."""
 
 from __future__ import annotations
 
@@ -9,31 +9,50 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapping.kernels import BORDER_SLACK
+from prim.arrays import BoolGrid, FloatArray
 from prim.errors import UsageError
 from prim.world import Bounds
 
 UNKNOWN = np.float32(0.5)
 UNKNOWN_GREY = 128
-"""What a probability of 0.5 is in an image."""
+"""Grey value of a probability of 0.5 in an image."""
 
-EVIDENCE_TOP = 10_000.0
-"""In an image, this many rays to a cell are white."""
+WHITE_EVIDENCE = 10_000.0
+"""In an image, this evidence (expected rays to a cell) and more is white: part of the networks' image definition."""
 
 MAX_CELLS = 200_000_000
-"""A grid of more cells is refused: it would not fit the memory of a laptop."""
+"""A grid of more cells is refused: it would not fit into a laptop's memory. Set by hand."""
 
 
 def cell_of(coordinate: float, resolution: float) -> int:
-    """Index of the cell that holds a coordinate (m); a border belongs to the cell above it."""
+    """Return the index of the cell that holds a coordinate; a border belongs to the cell above it.
+
+    Args:
+        coordinate: The coordinate (m).
+        resolution: Side of a cell (m).
+
+    Returns:
+        The index in the plane.
+    """
     return math.floor(coordinate / resolution + BORDER_SLACK)
 
 
 @dataclass(frozen=True, slots=True)
 class GridFrame:
-    """Where a grid lies: cells of ``resolution`` metres, ``rows`` x ``cols`` of them, from cell (``row``, ``col``).
+    """The place and size of a grid in the map frame.
 
-    Cell (r, c) of the plane covers [c, c + 1) x [r, r + 1) times the resolution, so that grids of one resolution
-    always fit on each other. Raises UsageError where it would have more than MAX_CELLS cells.
+    Cell (r, c) of the plane covers [c, c + 1) x [r, r + 1) times the resolution, so that grids of one resolution are
+    always aligned.
+
+    Attributes:
+        resolution: Side of a cell (m).
+        row: Row in the plane of the first cell.
+        col: Column in the plane of the first cell.
+        rows: Number of rows.
+        cols: Number of columns.
+
+    Raises:
+        UsageError: Where it would have more than MAX_CELLS cells.
     """
 
     resolution: float
@@ -52,7 +71,15 @@ class GridFrame:
 
     @classmethod
     def covering(cls, bounds: Bounds, resolution: float) -> GridFrame:
-        """The smallest frame that covers ``bounds`` (m)."""
+        """Return the smallest frame that covers bounds.
+
+        Args:
+            bounds: x0, y0, x1, y1 (m).
+            resolution: Side of a cell (m).
+
+        Returns:
+            The frame.
+        """
         x0, y0, x1, y1 = bounds
         row, col = cell_of(y0, resolution), cell_of(x0, resolution)
         rows = -cell_of(-y1, resolution) - row
@@ -61,42 +88,51 @@ class GridFrame:
 
     @property
     def origin(self) -> tuple[float, float]:
-        """x, y (m) of the lower left corner."""
+        """The lower left corner: x, y (m)."""
         return self.col * self.resolution, self.row * self.resolution
 
     @property
     def bounds(self) -> Bounds:
-        """x0, y0, x1, y1 (m)."""
+        """The bounds: x0, y0, x1, y1 (m)."""
         x, y = self.origin
         return x, y, (self.col + self.cols) * self.resolution, (self.row + self.rows) * self.resolution
 
     @property
     def shape(self) -> tuple[int, int]:
-        """Rows, columns."""
+        """The shape of the grid's arrays: rows, columns."""
         return self.rows, self.cols
 
     def union(self, other: GridFrame) -> GridFrame:
-        """The smallest frame that covers both."""
+        """Return the smallest frame that covers this one and another of the same resolution."""
         row, col = min(self.row, other.row), min(self.col, other.col)
         rows = max(self.row + self.rows, other.row + other.rows) - row
         cols = max(self.col + self.cols, other.col + other.cols) - col
         return GridFrame(self.resolution, row, col, rows, cols)
 
     def padded(self, pad: int) -> GridFrame:
-        """A frame larger by ``pad`` cells on all sides."""
+        """Return the frame that is larger by ``pad`` cells on all sides."""
         return GridFrame(self.resolution, self.row - pad, self.col - pad, self.rows + 2 * pad, self.cols + 2 * pad)
 
     def window(self, inner: GridFrame) -> tuple[slice, slice]:
-        """Where ``inner``, which must lie within, is in this frame's arrays."""
+        """Return the slices of this frame's arrays that a frame within it covers."""
         row, col = inner.row - self.row, inner.col - self.col
         return slice(row, row + inner.rows), slice(col, col + inner.cols)
+
+    def centres(self, cells: BoolGrid) -> FloatArray:
+        """Return the centres (N, 2) in metres of the marked cells (rows, cols)."""
+        rows, cols = np.nonzero(cells)
+        return np.asarray((np.column_stack((cols + self.col, rows + self.row)) + 0.5) * self.resolution)
 
 
 @dataclass(frozen=True, slots=True)
 class OccupancyGrid:
-    """``probability`` (rows, cols) float32 of occupancy, 0.5 where unknown; row 0 at the smallest y.
+    """An occupancy grid; row 0 is at the smallest y.
 
-    ``evidence`` (rows, cols) float32, where the mapper has it: how many rays are expected to have come to each cell.
+    Attributes:
+        frame: Where it lies.
+        probability: Probability of occupancy (rows, cols) float32, 0.5 where unknown.
+        evidence: Expected number of rays that reached each cell (rows, cols) float32; None where the mapper does not
+            compute it.
     """
 
     frame: GridFrame
@@ -104,41 +140,38 @@ class OccupancyGrid:
     evidence: NDArray[np.float32] | None = None
 
     @property
-    def occupied(self) -> NDArray[np.bool_]:
-        """Cells more likely occupied than not: the paper's rounding."""
+    def occupied(self) -> BoolGrid:
+        """Cells (rows, cols) more likely occupied than not: the paper's rounding."""
         return self.probability > UNKNOWN
 
     @property
-    def free(self) -> NDArray[np.bool_]:
-        """Cells more likely free than not."""
+    def free(self) -> BoolGrid:
+        """Cells (rows, cols) more likely free than not."""
         return self.probability < UNKNOWN
 
     def image(self) -> NDArray[np.uint8]:
-        """What a detector sees (rows, cols, 3): probability of occupancy, evidence, and whether the cell is known.
+        """Return the detector's image (rows, cols, 3) uint8: probability of occupancy, evidence, known or not.
 
-        The probability is 0 to 255; the evidence is logarithmic, 255 at EVIDENCE_TOP rays and more, and where the
-        mapper does not tell it, the same as the third: 255 where the cell is known, else 0. Row 0 at the smallest y.
+        The probability is scaled to 0 to 255. The evidence is logarithmic, 255 at WHITE_EVIDENCE rays and more; where
+        there is none it equals the third channel: 255 where the cell is known, else 0. Row 0 is at the smallest y.
         """
         known = np.where(self.occupied | self.free, np.uint8(255), np.uint8(0))
         evidence = known
         if self.evidence is not None:
-            scaled = np.log1p(self.evidence) * (255 / math.log1p(EVIDENCE_TOP))
+            scaled = np.log1p(self.evidence) * (255 / math.log1p(WHITE_EVIDENCE))
             evidence = np.clip(scaled, 0, 255).astype(np.uint8)
         probability = np.rint(self.probability * 255).astype(np.uint8)
         return np.stack((probability, evidence, known), axis=-1)
 
-    def centres(self, cells: NDArray[np.bool_]) -> NDArray[np.float64]:
-        """Centres (N, 2) in metres of the marked cells."""
-        rows, cols = np.nonzero(cells)
-        corner = np.column_stack((cols + self.frame.col, rows + self.frame.row))
-        return np.asarray((corner + 0.5) * self.frame.resolution, dtype=np.float64)
 
+class GrowingGrid:
+    """An array over the plane's cells that grows on demand, or has given bounds.
 
-class Layer:
-    """An array over the plane's cells that grows, or is held to given bounds.
-
-    ``array`` covers ``frame``; ``used`` is the part of it that has been asked for. A growing array reaches at least
-    ``margin`` metres beyond that.
+    Attributes:
+        array: The array (rows, cols).
+        frame: The frame that it covers.
+        used: The part of the frame that has been asked for; None before any has.
+        fixed: Whether the bounds were given.
     """
 
     def __init__(
@@ -149,6 +182,15 @@ class Layer:
         dtype: type[np.generic],
         margin: float = 0.0,
     ) -> None:
+        """Make the array.
+
+        Args:
+            resolution: Side of a cell (m).
+            bounds: x0, y0, x1, y1 (m); None: the array grows.
+            fill: Value of new cells.
+            dtype: The array's type.
+            margin: A growing array extends at least this far (m) beyond what has been asked for.
+        """
         self.resolution = resolution
         self.fixed = bounds is not None
         self.fill = fill
@@ -158,7 +200,14 @@ class Layer:
         self.array = np.full(self.frame.shape, fill, dtype)
 
     def cover(self, row: int, col: int, last_row: int, last_col: int) -> None:
-        """Grows the array to hold these cells (both ends included), unless its bounds were given."""
+        """Grow the array to hold a rectangle of cells of the plane, unless its bounds were given.
+
+        Args:
+            row: First row.
+            col: First column.
+            last_row: Last row, included.
+            last_col: Last column, included.
+        """
         if self.fixed:
             return
         needed = GridFrame(self.resolution, row, col, last_row - row + 1, last_col - col + 1)
@@ -174,6 +223,6 @@ class Layer:
         self.frame, self.array = grown, array
 
     def crop(self) -> tuple[GridFrame, NDArray[np.generic]]:
-        """The frame in use and a copy of its part of the array."""
+        """Return the frame in use and a copy of its part of the array."""
         used = self.used or self.frame
         return used, self.array[self.frame.window(used)].copy()

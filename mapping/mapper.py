@@ -1,4 +1,4 @@
-"""What a mapper is, and which there are."""
+"""The mappers' protocol, and their factory."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ from mapping.deterministic import DeterministicMapper
 from mapping.forward.mapper import ForwardMapper
 from mapping.grid import OccupancyGrid
 from mapping.probabilistic import ProbabilisticMapper
+from prim.choices import MapperName, SensorModelName
 from prim.errors import UsageError
 from prim.scan import Scan
 from prim.se2 import Pose2D
@@ -18,33 +19,55 @@ from prim.world import Bounds
 
 
 class Mapper(Protocol):
-    """Makes an occupancy grid of scans taken at known poses."""
+    """A mapper: builds an occupancy grid from scans taken at known poses."""
 
     name: str
 
     @property
     def noise_std(self) -> float | None:
-        """The sensor's noise (m) that the mapper reckons with; None where it does not."""
+        """Standard deviation of the range noise (m), given or estimated; None where the mapper has none."""
 
     def update(self, scan: Scan, pose: Pose2D) -> None:
-        """Adds one scan, taken by a laser at ``pose`` in the map frame."""
+        """Add one scan, or the next piece of one, and update the map.
 
-    def keep(self, scan: Scan, pose: Pose2D) -> object:
-        """As :meth:`update`, where nobody looks at the map before it is finished."""
+        Args:
+            scan: The scan.
+            pose: Pose of the laser in the map frame.
+        """
+
+    def accumulate(self, scan: Scan, pose: Pose2D) -> object:
+        """Add one scan without updating the map: :meth:`finish` gives the same, :meth:`grid` need not.
+
+        Args:
+            scan: The scan.
+            pose: Pose of the laser in the map frame.
+
+        Returns:
+            Nothing that callers of the protocol use.
+        """
 
     def grid(self) -> OccupancyGrid:
-        """The map so far; later updates do not change it."""
+        """Return the map so far; later updates do not change it."""
 
     def finish(self) -> OccupancyGrid:
-        """The map of all scans."""
+        """Return the map of all scans."""
 
 
-MAPPERS = ("det", "prob", "forward")
-SENSOR_MODELS = ("eq4", "gaussian")
+MAPPERS = tuple(name.value for name in MapperName)
+SENSOR_MODELS = tuple(name.value for name in SensorModelName)
 
 
 def check_mapper(name: str, sensor_model: str = "eq4", noise_std: float | None = None) -> None:
-    """Raises UsageError where there is no such mapper or sensor model, or where they do not go together."""
+    """Check that a mapper and a sensor model exist and fit together.
+
+    Args:
+        name: One of MAPPERS.
+        sensor_model: One of SENSOR_MODELS.
+        noise_std: Standard deviation of the range noise (m), where it is given.
+
+    Raises:
+        UsageError: Where they do not.
+    """
     if name not in MAPPERS:
         raise UsageError(f"there is no mapper {name!r}: choose from {', '.join(MAPPERS)}")
     if sensor_model not in SENSOR_MODELS:
@@ -66,18 +89,29 @@ def make_mapper(
     sensor_model: str = "eq4",
     noise_std: float | None = None,
 ) -> Mapper:
-    """A mapper by name, over given or growing ``bounds`` (m), its kernels compiled.
+    """Make a mapper by name, its kernels compiled.
 
-    ``noise_std`` (m) is the sensor's noise: ``forward`` finds it where it is not given, ``prob`` needs it for the
-    ``gaussian`` sensor model. Raises UsageError.
+    Args:
+        name: One of MAPPERS.
+        resolution: Side of a cell (m).
+        bounds: x0, y0, x1, y1 (m) of the map; None: it grows with the scans.
+        sensor_model: One of SENSOR_MODELS; other than ``eq4`` for ``prob`` alone.
+        noise_std: Standard deviation of the range noise (m): ``forward`` estimates it where it is not given, the
+            ``gaussian`` sensor model needs it.
+
+    Returns:
+        The mapper.
+
+    Raises:
+        UsageError: Where the arguments do not fit together.
     """
     check_mapper(name, sensor_model, noise_std)
     if sensor_model == "gaussian" and noise_std is None:
         raise UsageError("the Gaussian sensor model needs --noise-std")
-    trial = _make(name, 0.5, (-1.0, -1.0, 1.0, 1.0), noise_std)
-    trial.update(_FEW_RAYS, Pose2D(0.1, 0.1))
-    trial.grid()
-    trial.finish()
+    warm_up = _make(name, 0.5, (-1.0, -1.0, 1.0, 1.0), noise_std)
+    warm_up.update(_WARM_UP_SCAN, Pose2D(0.1, 0.1))
+    warm_up.grid()
+    warm_up.finish()
     return _make(name, resolution, bounds, noise_std)
 
 
@@ -89,4 +123,4 @@ def _make(name: str, resolution: float, bounds: Bounds | None, noise_std: float 
     return DeterministicMapper(resolution, bounds)
 
 
-_FEW_RAYS = Scan(0, "", 0.0, 2.0, 0.1, 1.0, np.array([0.7, -np.inf, np.inf], dtype=np.float32))
+_WARM_UP_SCAN = Scan(0, "", 0.0, 2.0, 0.1, 1.0, np.array([0.7, -np.inf, np.inf], dtype=np.float32))

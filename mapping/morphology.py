@@ -1,4 +1,4 @@
-"""Morphology of cells: dilation, neighbours, connected components, cell centres."""
+"""Binary morphology of grids: dilation, neighbourhoods, connected components."""
 
 from __future__ import annotations
 
@@ -8,12 +8,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapping.grid import GridFrame
-from prim.arrays import BoolGrid, FloatArray
+from prim.arrays import BoolGrid
 from prim.compiled import kernel
 
 
 def dilate(cells: BoolGrid, steps: int) -> BoolGrid:
-    """The cells and all within ``steps`` cells of them (8 neighbours)."""
+    """Dilate cells by a square.
+
+    Args:
+        cells: Marked cells (rows, cols).
+        steps: Half the square's side (cells): 1 adds the 8 neighbours.
+
+    Returns:
+        The marked cells and all within ``steps`` cells of them.
+    """
     grown = cells.copy()
     for axis in (0, 1):
         line = grown.copy()
@@ -25,31 +33,44 @@ def dilate(cells: BoolGrid, steps: int) -> BoolGrid:
     return grown
 
 
-def connected_components(occupied: BoolGrid, frame: GridFrame, largest: float) -> tuple[NDArray[np.int32], BoolGrid]:
-    """Connected components of occupied cells (8 neighbours): labels from 1 on, and which cells are of large ones.
+def connected_components(
+    occupied: BoolGrid, frame: GridFrame, max_extent: float
+) -> tuple[NDArray[np.int32], BoolGrid]:
+    """Label the connected components of occupied cells (8 neighbours) and find the large ones.
 
-    A component is large where it extends over more than ``largest`` metres along an axis.
+    Args:
+        occupied: Occupied cells (rows, cols).
+        frame: The grid's frame.
+        max_extent: A component is large where it extends over more than this (m) along an axis.
+
+    Returns:
+        Labels (rows, cols) from 1 on, 0 where a cell is not occupied; and which cells (rows, cols) belong to large
+        components.
     """
     labels, large = np.zeros(occupied.shape, np.int32), np.zeros_like(occupied)
-    number_connected(occupied, largest / frame.resolution, labels, large)
+    label_components(occupied, max_extent / frame.resolution, labels, large)
     return labels, large
 
 
 @kernel
-def number_connected(occupied: Any, most: float, labels: Any, large: Any) -> None:
-    """Numbers occupied cells (rows, cols) by what hangs together, through any of 8 neighbours, from 1 on: ``labels``.
+def label_components(occupied: Any, max_extent: float, labels: Any, large: Any) -> None:
+    """Label connected components (8 neighbours) by flood fill.
 
-    ``large`` are those of what reaches over more than ``most`` cells along an axis.
+    Args:
+        occupied: Occupied cells (rows, cols).
+        max_extent: A component is large where it extends over more than this (cells) along an axis.
+        labels: Filled (rows, cols) with labels from 1 on; zeros beforehand.
+        large: Set (rows, cols) for cells of large components; False beforehand.
     """
     rows, cols = occupied.shape
     stack = np.empty((occupied.sum(), 2), np.int64)
-    number = 0
+    label = 0
     for row in range(rows):
         for col in range(cols):
             if not occupied[row, col] or labels[row, col]:
                 continue
-            number += 1
-            labels[row, col] = number
+            label += 1
+            labels[row, col] = label
             stack[0] = row, col
             done, found = 0, 1
             bottom, left, right = row, col, col
@@ -60,21 +81,15 @@ def number_connected(occupied: Any, most: float, labels: Any, large: Any) -> Non
                 for near_r in range(max(r - 1, 0), min(r + 2, rows)):
                     for near_c in range(max(c - 1, 0), min(c + 2, cols)):
                         if occupied[near_r, near_c] and not labels[near_r, near_c]:
-                            labels[near_r, near_c] = number
+                            labels[near_r, near_c] = label
                             stack[found] = near_r, near_c
                             found += 1
-            if max(bottom - row, right - left) + 1 > most:
+            if max(bottom - row, right - left) + 1 > max_extent:
                 for cell in range(found):
                     large[stack[cell, 0], stack[cell, 1]] = True
 
 
 def beside_free(free: BoolGrid) -> BoolGrid:
-    """Cells with a neighbour (4) that is free."""
+    """Return which cells (rows, cols) have a free cell among their 4 neighbours."""
     padded = np.pad(free, 1)
     return np.asarray(padded[:-2, 1:-1] | padded[2:, 1:-1] | padded[1:-1, :-2] | padded[1:-1, 2:])
-
-
-def centres(chosen: BoolGrid, frame: GridFrame) -> FloatArray:
-    """The centres (N, 2) in metres of some of a grid's cells."""
-    rows, cols = np.nonzero(chosen)
-    return np.asarray((np.column_stack((cols + frame.col, rows + frame.row)) + 0.5) * frame.resolution)

@@ -18,6 +18,7 @@ TRAINING = {"torch", "torchvision", "ultralytics"}
 MAY_TRAIN = ("detect/training", "detect/evaluation")
 
 SOURCES = sorted(path for part in PARTS for path in (ROOT / part).glob("**/*.py"))
+OUTSIDE = sorted(path for part in ("bench", "docs") for path in (ROOT / part).glob("*.py"))
 
 
 def imported(path: Path) -> set[str]:
@@ -46,3 +47,12 @@ def test_library_code_neither_prints_nor_exits(path: Path) -> None:
     for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
         if isinstance(node, ast.Call):
             assert ast.unparse(node.func) not in ("print", "sys.exit", "exit", "typer.echo")
+
+
+@pytest.mark.parametrize("path", OUTSIDE, ids=lambda path: path.relative_to(ROOT).as_posix())
+def test_benches_and_docs_use_public_names_only(path: Path) -> None:
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        if isinstance(node, ast.Attribute) and node.attr.startswith("_") and not node.attr.startswith("__"):
+            assert ast.unparse(node.value) in ("self", "cls"), ast.unparse(node)
+        if isinstance(node, ast.ImportFrom):
+            assert not [alias.name for alias in node.names if alias.name.startswith("_")]

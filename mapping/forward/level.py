@@ -1,4 +1,8 @@
-"""One resolution of the forward mapper: its parameters, and the passes of expectation-maximisation over them."""
+"""One resolution level of the forward mapper: its rays, its parameters, and its E and M steps.
+
+The sensor model and the E step's kernel are in :mod:`mapping.forward.likelihood`, the prior and the M step's kernel
+in :mod:`mapping.forward.sieve`.
+"""
 
 from __future__ import annotations
 
@@ -6,160 +10,160 @@ import math
 from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from typing import Any
+from enum import IntEnum
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from mapping.forward.likelihood import (
-    CERTAIN,
     HITS,
     LOG_LIKELIHOOD,
+    OUTLIERS,
     PASSES,
     RAYS,
     SQUARES,
+    SQUARES_OF_ARRIVAL,
     STOPS,
-    WILD,
+    RayModel,
+    count_skips,
     expect,
-    find_leads,
-    tables,
+    noise_tables,
 )
-from mapping.forward.sieve import LEAST, MOST, blur, borders, gather, maximize, normalise, taps
+from mapping.forward.options import DEFAULTS, ForwardOptions
+from mapping.forward.sieve import blur, gaussian_kernel, kernel_sums, maximize, normalize, reduce_blocks
 from mapping.grid import GridFrame
+from mapping.kernels import Fields
 from mapping.morphology import dilate
-from prim.arrays import FloatArray
 from prim.scan import Scan
-from prim.se2 import Pose2D
+from prim.se2 import Pose2D, rotate
 
-LEAST_BLOCKS, MOST_BLOCKS = 2, 8
+MIN_BLOCKS, MAX_BLOCKS = 2, 8
 BLOCK_CELLS = 4_000_000
-"""Sums are kept for so many blocks of rays, for the fewer the larger the grid: about this many cells in all.
-
-The number of blocks depends on the grid alone, and they are added up in order: any number of threads gives the same
-bits.
-"""
-
-SMOOTHING = 0.3
-"""The sieve's Gaussian is SMOOTHING * sqrt(sigma * resolution) wide: found by measuring (docs/forward.md)."""
-
-NEGLIGIBLE = 1e-4
-"""Cells that a coarser level gives no larger chance to stop a ray are left free by the finer ones."""
-
-LEAST_WILD, MOST_WILD = 1e-4, 0.3
-"""The bounds of the share of wild measurements."""
-
-LEAST_NOISE = 0.15
-"""The noise is never taken as smaller than this many cells."""
+"""The E step's sums are computed for this many blocks of rays: fewer on larger grids, for about BLOCK_CELLS cells in
+all. The number depends on the grid alone, and blocks are added up in order, so that any number of threads gives the
+same bits."""
 
 COLUMNS = 3
-"""Sums are kept of hits, of passes and, where it is asked for, of how certain those are."""
+"""Columns of the E step's sums with certainty; without it there is one less."""
 
-MOST_NOISE = 5.0
-"""Nor as larger than this (m)."""
-
-LEAST_STOPS = 5.0
-"""Nothing is learned about the noise from fewer rays that were stopped."""
-
-FARTHEST = 1000.0
-"""A sensor without a range_max is taken to see this far (m)."""
-
-_TABLE = tables()
-_NO_LEADS = np.zeros(0, np.int32)
+_TABLE = noise_tables()
+_NO_SKIPS = np.zeros(0, np.int32)
 
 
-@dataclass(frozen=True, slots=True)
-class Noise:
-    """What the sensor adds: Gaussian noise of ``std`` metres, and a share of ``wild`` measurements."""
+class RangeNoise(NamedTuple):
+    """Range noise: Gaussian, with a share of outliers.
+
+    Attributes:
+        std: Standard deviation sigma (m).
+        outlier_share: The share epsilon of outliers.
+    """
 
     std: float
-    wild: float = LEAST_WILD
+    outlier_share: float
 
 
 @dataclass(frozen=True, slots=True)
-class Totals:
-    """Sums over rays of one E step: log-likelihood, their number, and what the noise is found from."""
+class SufficientStatistics:
+    """Sums over the rays of an E step, sufficient for the M step of the range noise.
+
+    Attributes:
+        log_likelihood: Log-likelihood of the rays (nats).
+        rays: Number of rays that cross the grid.
+        stops: Expected number of rays that stop in the grid.
+        squares: Expected sum of their squared residuals (z - s)^2, in sigma^2.
+        outliers: Expected number of outliers.
+    """
 
     log_likelihood: float
     rays: int
     stops: float
     squares: float
-    wild: float
+    outliers: float
 
     @property
-    def per_ray(self) -> float:
-        """The mean log-likelihood of a ray."""
+    def mean_log_likelihood(self) -> float:
+        """Mean log-likelihood of a ray (nats)."""
         return self.log_likelihood / self.rays if self.rays else 0.0
 
-    @property
-    def tell_noise(self) -> bool:
-        """Whether enough rays were stopped to learn the noise from them."""
-        return self.stops >= LEAST_STOPS
+    def determines_noise(self, options: ForwardOptions = DEFAULTS) -> bool:
+        """Return whether enough rays stopped to estimate the range noise from them."""
+        return self.stops >= options.min_stops
 
-    def noise(self, before: Noise, resolution: float) -> Noise:
-        """The M step of the noise."""
-        if not self.tell_noise:
-            return before
-        std = before.std * math.sqrt(self.squares / self.stops)
-        wild = min(max(self.wild / self.rays, LEAST_WILD), MOST_WILD)
-        return Noise(min(max(std, LEAST_NOISE * resolution), MOST_NOISE), wild)
+    def range_noise(self, previous: RangeNoise, resolution: float, options: ForwardOptions = DEFAULTS) -> RangeNoise:
+        """Compute the M step of the range noise.
+
+        Args:
+            previous: The noise of the E step.
+            resolution: Side of a cell (m).
+            options: The estimate's bounds.
+
+        Returns:
+            The estimate; ``previous`` where too few rays stopped.
+        """
+        if not self.determines_noise(options):
+            return previous
+        std = previous.std * math.sqrt(self.squares / self.stops)
+        share = min(max(self.outliers / self.rays, options.min_outlier_share), options.max_outlier_share)
+        return RangeNoise(min(max(std, options.min_noise_cells * resolution), options.max_noise), share)
 
 
-class Rays:
-    """All rays so far, 12 bytes each, and the scans that they belong to.
+class RayStore:
+    """All rays so far, 12 bytes each, and their scans; grows in amortised constant time."""
 
-    ``rays``, ``scans`` and ``first`` are as :func:`mapping.forward.likelihood.expect` takes them.
-    """
+    def __init__(self, max_range: float = DEFAULTS.max_range) -> None:
+        """Start without rays.
 
-    def __init__(self) -> None:
+        Args:
+            max_range: The range_max (m) of sensors that have none.
+        """
         self._rays = np.empty((0, 3), np.float32)
         self._scans = np.empty((0, 4), np.float64)
         self._first = np.zeros(1, np.int64)
         self._count = 0
+        self._max_range = max_range
 
     def __len__(self) -> int:
         return int(self._first[self._count])
 
     @property
-    def rays(self) -> NDArray[np.float32]:
-        """Directions in the plane and ranges."""
-        return self._rays[: len(self)]
+    def ranges(self) -> NDArray[np.float32]:
+        """Ranges (N,) in m; -inf: nearer than range_min, inf: no return."""
+        return self._rays[: len(self), 2]
 
     @property
-    def scans(self) -> FloatArray:
-        """Sensor's x, y, range_min, range_max of every scan."""
-        return self._scans[: self._count]
-
-    @property
-    def first(self) -> NDArray[np.int64]:
-        """Where each scan's rays begin, and where the last one's end."""
-        return self._first[: self._count + 1]
+    def arrays(self) -> Fields:
+        """The fields of :class:`mapping.forward.likelihood.RayArrays`, as a plain tuple."""
+        count = self._count
+        return self._scans[:count], self._first[: count + 1], self._rays[: len(self)]
 
     def add(self, scan: Scan, pose: Pose2D) -> int:
-        """Adds a scan's measurements; returns how many.
+        """Add a scan's measurements, see :meth:`prim.scan.Scan.censored_ranges`.
 
-        Those are ranges within the limits, -inf (nearer than range_min, as REP 117 has it) and ranges of range_max
-        and more (no return). NaN and numbers below range_min say nothing.
+        Args:
+            scan: The scan.
+            pose: Pose of the laser in the map frame.
+
+        Returns:
+            The number of measurements.
         """
-        z = scan.ranges
-        with np.errstate(invalid="ignore"):
-            used = ((z >= scan.range_min) & (z > 0)) | (np.isneginf(z) & (scan.range_min > 0))
-        cos, sin = math.cos(pose.theta), math.sin(pose.theta)
-        directions = scan.directions[used] @ np.array([[cos, sin], [-sin, cos]])
+        used, ranges = scan.censored_ranges()
+        directions = rotate(scan.directions[used], pose.theta)
         count = len(directions)
         begin, end = len(self), len(self) + count
         self._rays = _grown(self._rays, end)
         self._scans = _grown(self._scans, self._count + 1)
         self._first = _grown(self._first, self._count + 2)
         self._rays[begin:end, :2] = directions
-        self._rays[begin:end, 2] = np.where(z[used] >= scan.range_max, np.inf, z[used])
-        self._scans[self._count] = pose.x, pose.y, max(scan.range_min, 0.0), min(scan.range_max, FARTHEST)
+        self._rays[begin:end, 2] = ranges
+        self._scans[self._count] = pose.x, pose.y, max(scan.range_min, 0.0), min(scan.range_max, self._max_range)
         self._count += 1
         self._first[self._count] = end
         return count
 
 
 def _grown(array: NDArray[Any], length: int) -> NDArray[Any]:
-    """The array, or a copy with room for twice as many rows where it has fewer than ``length``."""
+    """Return the array, or a copy with room for twice as many rows where it has fewer than ``length``."""
     if len(array) >= length:
         return array
     grown = np.empty((max(2 * len(array), length), *array.shape[1:]), array.dtype)
@@ -167,143 +171,192 @@ def _grown(array: NDArray[Any], length: int) -> NDArray[Any]:
     return grown
 
 
-@dataclass(frozen=True, slots=True)
-class Choice:
-    """Which rays a pass takes: ``begin`` to ``end``, every ``stride``-th.
+class Fold(IntEnum):
+    """Which rays an E step takes with respect to those that are held out."""
 
-    Without those held out (``held_out`` 1), only those (-1), or all (0).
+    ALL = 0
+    FITTED = 1
+    HELD_OUT = -1
+
+
+@dataclass(frozen=True, slots=True)
+class RaySubset:
+    """The rays that an E step takes.
+
+    Attributes:
+        begin: Index of the first ray.
+        end: Index after the last ray; None: all from ``begin`` on.
+        stride: Every ``stride``-th ray is taken.
+        fold: All of these, those that are not held out, or those that are.
     """
 
     begin: int = 0
     end: int | None = None
     stride: int = 1
-    held_out: int = 0
+    fold: Fold = Fold.ALL
 
 
-ALL = Choice()
+ALL_RAYS = RaySubset()
+
+
+def sensor_fields(noise: RangeNoise, rays: RayModel) -> Fields:
+    """Return the fields of :class:`mapping.forward.likelihood.SensorModel`.
+
+    Args:
+        noise: The range noise.
+        rays: The parameters that are not estimated.
+
+    Returns:
+        The fields, as a plain tuple.
+    """
+    return noise.std, noise.outlier_share, tuple(rays), _TABLE
+
+
+def geometry_fields(frame: GridFrame) -> Fields:
+    """Return the fields of :class:`mapping.forward.likelihood.GridGeometry`, as a plain tuple."""
+    return *frame.origin, frame.resolution
 
 
 class Level:
-    """A map of stopping chances at one resolution.
+    """A map of stopping probabilities at one resolution.
 
-    ``parameters`` (rows, cols) float32 are the sieve's, ``stopping`` the chances they make: their weighted mean over
-    neighbours.
+    Attributes:
+        frame: Where its cells lie.
+        parameters: The sieve's parameters p (rows, cols) float32.
+        stopping: The stopping probabilities o = K p (rows, cols) float32.
+        blocks: Number of blocks of rays that the E step's sums are computed for.
     """
 
-    def __init__(self, frame: GridFrame, start: float, pool: ThreadPoolExecutor | None = None) -> None:
+    def __init__(
+        self,
+        frame: GridFrame,
+        start: float,
+        pool: ThreadPoolExecutor | None = None,
+        options: ForwardOptions = DEFAULTS,
+    ) -> None:
+        """Start with equal parameters and without smoothing.
+
+        Args:
+            frame: Where its cells lie.
+            start: Value of all parameters.
+            pool: Threads that the blocks of an E step are distributed to; None: the caller's alone.
+            options: Options of the sieve and of the sensor model.
+        """
         self.frame = frame
+        self.options = options
         self._pool = pool
         self.parameters = np.full(frame.shape, start, np.float32)
         self.stopping = self.parameters.copy()
         self._active = np.ones(frame.shape, np.bool_)
-        self._leads: NDArray[np.int32] | None = None
-        self._hits, self._passes, self._blurred, self._between = (np.empty(frame.shape, np.float32) for _ in range(4))
-        self.blocks = max(LEAST_BLOCKS, min(MOST_BLOCKS, BLOCK_CELLS // (frame.rows * frame.cols)))
+        self._skip: NDArray[np.int32] | None = None
+        self._hits, self._passes, self._blurred, self._scratch = (np.empty(frame.shape, np.float32) for _ in range(4))
+        self._bounds = np.float32(options.min_stopping), np.float32(options.max_stopping)
+        self._geometry = geometry_fields(frame)
+        self.blocks = max(MIN_BLOCKS, min(MAX_BLOCKS, BLOCK_CELLS // (frame.rows * frame.cols)))
         self.smooth(0.0)
 
-    @property
-    def _corner(self) -> FloatArray:
-        return np.array(self.frame.origin)
-
     def smooth(self, std: float) -> None:
-        """Sets the sieve's width for noise of ``std`` metres."""
-        self._taps = taps(smoothing_width(std, self.frame.resolution) / self.frame.resolution)
-        self._row_sums = borders(self.frame.rows, self._taps)
-        self._col_sums = borders(self.frame.cols, self._taps)
-        self._spread()
+        """Set the sieve's width to that for range noise of standard deviation ``std`` (m)."""
+        options = self.options
+        width = smoothing_width(std, self.frame.resolution, options) / self.frame.resolution
+        self._kernel = gaussian_kernel(width, options.min_smoothing_cells, options.kernel_truncation)
+        self._row_sums = kernel_sums(self.frame.rows, self._kernel)
+        self._col_sums = kernel_sums(self.frame.cols, self._kernel)
+        self._update_stopping()
 
-    def start_from(self, coarser: Level) -> None:
-        """Takes over a coarser level's map: a ray that crosses one of its cells crosses several here."""
+    def initialize_from(self, coarser: Level) -> None:
+        """Start from a coarser level's map: a ray that crosses one of its cells crosses several of this level."""
         ratio = round(coarser.frame.resolution / self.frame.resolution)
-        finer = coarser.parameters[cells_within(coarser.frame, self.frame)]
-        self.parameters = np.clip(1 - (1 - finer) ** np.float32(1 / ratio), LEAST, MOST).astype(np.float32)
-        self._spread()
+        finer = coarser.parameters[coarse_cell_index(coarser.frame, self.frame)]
+        low, high = self.options.min_stopping, self.options.max_stopping
+        self.parameters = np.clip(1 - (1 - finer) ** np.float32(1 / ratio), low, high).astype(np.float32)
+        self._update_stopping()
 
-    def adopt(self, smaller: Level) -> None:
-        """Takes over the map of a level with the same cells on a smaller frame."""
+    def copy_from(self, smaller: Level) -> None:
+        """Copy the parameters of a level of the same resolution whose frame lies within this one's."""
         self.parameters[self.frame.window(smaller.frame)] = smaller.parameters
-        self._spread()
+        self._update_stopping()
 
-    def restore(self, parameters: NDArray[np.float32]) -> None:
-        """Goes back to parameters that it had."""
+    def set_parameters(self, parameters: NDArray[np.float32]) -> None:
+        """Set the sieve's parameters (rows, cols)."""
         self.parameters = parameters
-        self._spread()
+        self._update_stopping()
 
-    def keep_free(self, rays: Rays) -> None:
-        """Leaves cells that stop next to nothing free for good, and passes over them where rays begin."""
-        self._active = self.parameters > NEGLIGIBLE
+    def fix_free_cells(self, rays: RayStore) -> None:
+        """Fix cells with a negligible stopping probability at 0, and skip them where these rays begin."""
+        self._active = self.parameters > self.options.negligible_stopping
         self.parameters[~self._active] = 0
-        marked = dilate(self._active, len(self._taps) // 2)
-        leads = np.zeros(len(rays), np.int32)
-        scans, first, resolution = rays.scans, rays.first, self.frame.resolution
+        marked = dilate(self._active, len(self._kernel) // 2)
+        skip = np.zeros(len(rays), np.int32)
+        arrays = rays.arrays
         self._in_blocks(
-            lambda block, begin, end: find_leads(
-                scans, first, rays.rays, begin, end, self._corner, resolution, marked, leads
-            ),
-            0,
-            len(rays),
+            lambda block, begin, end: count_skips(arrays, begin, end, self._geometry, marked, skip), 0, len(rays)
         )
-        self._leads = leads
-        self._spread()
+        self._skip = skip
+        self._update_stopping()
 
-    def free_all(self) -> None:
-        """Takes back :meth:`keep_free`."""
+    def release_free_cells(self) -> None:
+        """Undo :meth:`fix_free_cells`: all cells may change again, and no cells are skipped."""
         self._active[:] = True
-        self._leads = None
+        self._skip = None
 
     def expect(
-        self, rays: Rays, noise: Noise, choice: Choice = ALL, certain: bool = False
-    ) -> tuple[NDArray[np.float32], Totals]:
-        """The E step: ``sums`` (blocks, rows * cols, 3 or 2), as the kernel ``expect`` fills them."""
-        sums = np.zeros((self.blocks, self.parameters.size, COLUMNS if certain else COLUMNS - 1), np.float32)
+        self, rays: RayStore, noise: RangeNoise, subset: RaySubset = ALL_RAYS, with_certainty: bool = False
+    ) -> tuple[NDArray[np.float32], SufficientStatistics]:
+        """Compute the E step.
+
+        Args:
+            rays: All rays.
+            noise: The range noise.
+            subset: The rays that are taken.
+            with_certainty: Whether the sums get a third column.
+
+        Returns:
+            The sums (blocks, rows * cols, 2 or 3) per cell, as :func:`mapping.forward.likelihood.expect` fills them;
+            and the sums over rays.
+        """
+        sums = np.zeros((self.blocks, self.parameters.size, COLUMNS if with_certainty else COLUMNS - 1), np.float32)
         totals = np.zeros((self.blocks, 6))
-        leads = self._leads if self._leads is not None else _NO_LEADS
-        scans, first, resolution = rays.scans, rays.first, self.frame.resolution
+        skip = self._skip if self._skip is not None else _NO_SKIPS
+        arrays, sensor = rays.arrays, sensor_fields(noise, self.options.ray_model)
+        stride, fold, every = subset.stride, int(subset.fold), self.options.hold_out_every
 
         def run(block: int, begin: int, end: int) -> None:
-            expect(
-                scans,
-                first,
-                rays.rays,
-                begin,
-                end,
-                choice.stride,
-                choice.held_out,
-                self._corner,
-                resolution,
-                self.stopping,
-                leads,
-                noise.std,
-                noise.wild,
-                _TABLE,
-                sums[block],
-                totals[block],
-            )
+            part = (begin, end, stride, fold, every)
+            expect(arrays, part, self._geometry, self.stopping, skip, sensor, sums[block], totals[block])
 
-        self._in_blocks(run, choice.begin, len(rays) if choice.end is None else choice.end)
+        self._in_blocks(run, subset.begin, len(rays) if subset.end is None else subset.end)
         total = totals.sum(axis=0)
-        return sums, Totals(total[LOG_LIKELIHOOD], int(total[RAYS]), total[STOPS], total[SQUARES], total[WILD])
+        statistics = SufficientStatistics(
+            total[LOG_LIKELIHOOD], int(total[RAYS]), total[STOPS], total[SQUARES], total[OUTLIERS]
+        )
+        return sums, statistics
 
     def maximize(self, sums: NDArray[np.float32], power: int = 1) -> None:
-        """The M step of the map; over-relaxed where ``power`` is above 1."""
-        gather(sums, self.stopping, self._row_sums, self._col_sums, self._hits, self._passes)
-        if len(self._taps) > 1:
-            for array in (self._hits, self._passes):
-                blur(array, self._taps, self._between, self._blurred)
-                array[:] = self._blurred
-        maximize(self.parameters, self._active, self._hits, self._passes, power)
-        self._spread()
+        """Compute the M step of the map.
 
-    def _spread(self) -> None:
-        """Makes the stopping chances of the parameters."""
-        if len(self._taps) == 1:
-            np.clip(self.parameters, LEAST, MOST, out=self.stopping)
+        Args:
+            sums: The E step's sums (blocks, rows * cols, 2 or 3).
+            power: Exponent of the odds ratio; above 1 the step is over-relaxed.
+        """
+        reduce_blocks(sums, self.stopping, self._row_sums, self._col_sums, self._hits, self._passes)
+        if len(self._kernel) > 1:
+            for array in (self._hits, self._passes):
+                blur(array, self._kernel, self._scratch, self._blurred)
+                array[:] = self._blurred
+        maximize(self.parameters, self._active, self._hits, self._passes, power, self._bounds)
+        self._update_stopping()
+
+    def _update_stopping(self) -> None:
+        """Compute the stopping probabilities o = K p."""
+        if len(self._kernel) == 1:
+            np.clip(self.parameters, *self._bounds, out=self.stopping)
             return
-        blur(self.parameters, self._taps, self._between, self.stopping)
-        normalise(self.stopping, self._row_sums, self._col_sums)
+        blur(self.parameters, self._kernel, self._scratch, self.stopping)
+        normalize(self.stopping, self._row_sums, self._col_sums, self._bounds)
 
     def _in_blocks(self, run: Callable[[int, int, int], None], begin: int, end: int) -> None:
-        """Calls ``run`` for each block of rays, in threads where there is a pool."""
+        """Call ``run(block, begin, end)`` for each block of rays, in threads where there is a pool."""
         edges = np.linspace(begin, end, self.blocks + 1).astype(np.int64)
         spans: Iterable[tuple[int, int, int]] = list(zip(range(self.blocks), edges[:-1], edges[1:], strict=True))
         if self._pool is None:
@@ -313,21 +366,45 @@ class Level:
             list(self._pool.map(lambda span: run(*span), spans))
 
 
-def cells_within(coarse: GridFrame, fine: GridFrame) -> tuple[NDArray[np.signedinteger[Any]], ...]:
-    """The index into a coarse frame's arrays that gives each of a finer frame's cells the cell it lies in."""
+def coarse_cell_index(coarse: GridFrame, fine: GridFrame) -> tuple[NDArray[np.signedinteger[Any]], ...]:
+    """Return the index into a coarse frame's array that gives each cell of a finer frame the cell that it lies in.
+
+    Args:
+        coarse: The coarse frame; covers the fine one.
+        fine: The fine frame.
+
+    Returns:
+        The index; it makes an array (rows, cols) of the fine frame.
+    """
     ratio = round(coarse.resolution / fine.resolution)
     rows = (np.arange(fine.rows) + fine.row) // ratio - coarse.row
     cols = (np.arange(fine.cols) + fine.col) // ratio - coarse.col
     return np.ix_(rows, cols)
 
 
-def smoothing_width(std: float, resolution: float) -> float:
-    """The sieve's standard deviation (m) at noise of ``std`` metres."""
-    return SMOOTHING * math.sqrt(std * resolution)
+def smoothing_width(std: float, resolution: float, options: ForwardOptions = DEFAULTS) -> float:
+    """Return the width of the sieve's Gaussian kernel.
+
+    Args:
+        std: Standard deviation of the range noise (m).
+        resolution: Side of a cell (m).
+        options: The sieve's options.
+
+    Returns:
+        The kernel's standard deviation (m).
+    """
+    return options.smoothing * math.sqrt(std * resolution)
 
 
-def evidence_of(sums: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Each cell's evidence (expected hits and passes), and the mean chance of those rays to have come there."""
+def evidence_and_certainty(sums: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Return the evidence and the certainty of each cell, see :class:`mapping.forward.mapper.ForwardFit`.
+
+    Args:
+        sums: The E step's sums (blocks, rows * cols, 3).
+
+    Returns:
+        Both (rows * cols,).
+    """
     added = sums.sum(axis=0)
     evidence = added[:, HITS] + added[:, PASSES]
-    return evidence, added[:, CERTAIN] / np.maximum(evidence, np.float32(1e-9))
+    return evidence, added[:, SQUARES_OF_ARRIVAL] / np.maximum(evidence, np.float32(1e-9))

@@ -1,99 +1,218 @@
-"""The compiled kernels of the forward sensor model: what every ray says about the cells on its way.
+"""Compiled kernels of the forward sensor model: likelihoods of ranges, and the E step of expectation-maximisation.
 
-A ray crosses one cell for each step along its major axis. Each cell holds a chance ``o`` to stop a ray that enters
-it; ``expect`` walks the rays, weighs for each of them where it may have stopped by what it measured, and adds that
-up per cell: the E step of the expectation-maximisation in mapping.forward.mapper. All lengths inside are in cells.
+The model. Each cell c has a stopping probability o_c: that of a ray that enters the cell to end there. A ray crosses
+cells k = 0, 1, ..., one for each step along its major axis, whose centres lie at distances s_k along the ray. It
+reaches cell k with the transmittance T_k = prod_{j < k} (1 - o_j), and ends there with probability T_k o_k. A ray
+that ends at distance s is measured as z ~ N(s, sigma^2). With the share epsilon of outliers, z has the density
 
-Compiled code is cached beside this file and made anew when this file changes, so that every constant it uses must
-stand here.
+    p(z) = (1 - epsilon) [sum_k T_k o_k N(z; s_k, sigma) + T_exit E(z) + B(z)] + epsilon O(z).
+
+E is the density of rays that leave the grid (:func:`likelihood_beyond`), B that of rays from a sensor off the grid
+that end before they enter it (:func:`likelihood_before`), O that of outliers (:func:`outlier_likelihood`). -inf
+(nearer than range_min, REP 117) and no returns are censored measurements: N is replaced by the probability of its
+tail.
+
+The E step. The responsibilities q_k = (1 - epsilon) T_k o_k N(z; s_k, sigma) / p(z), with those of exit, entry and
+outlier, sum to 1. Cell k receives q_k as an expected hit, and the responsibility of all that lies behind it (exit
+included, outlier not) as an expected pass (Thrun, «Learning occupancy grid maps with forward sensor models», 2003).
+
+All lengths inside the kernels are in cells. Numba's cache watches only this file: constants that the kernels use must
+stand here, model parameters are arguments. Callers pass the fields of named tuples as plain tuples, which numba
+recognises faster, and the kernels name them.
 """
 
 from __future__ import annotations
 
 import math
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from mapping.kernels import Fields
+from prim.arrays import FloatArray
 from prim.compiled import compiled, inline, kernel
 
 SHIFT = 32
 ONE = float(1 << SHIFT)
+"""The fixed-point format of a ray's minor coordinate: number of fractional bits, and 1."""
+
 FAR_CELLS = float(1 << 20)
-"""A ray that starts further off the grid is not followed."""
+"""A ray from a sensor farther off the grid than this (cells) is not traced: the fixed-point format would overflow."""
 
 REACH = 6.0
-"""Beyond this many standard deviations the Gaussian is nothing."""
+"""Beyond this many standard deviations the Gaussian counts as 0."""
 
 SPACING = 64
-"""Entries per standard deviation in the tables."""
+"""Entries of the tables per standard deviation."""
 
 TOP = int(2 * REACH * SPACING)
+"""Index of the tables' last entry."""
 
 CUT = REACH**2 / 512
-"""Where the Gaussian ends, in x^2 / 512."""
+"""REACH in the variable x^2 / 512 of :func:`weight_measured`."""
 
 CHUNK = 32
-"""So many cells are walked before it is asked whether a ray is spent."""
+"""Cells that are traversed between two tests of whether a ray's transmittance is still above the cutoff."""
 
-HOLD_OUT = 5
-"""Every so manyth ray is held out where the noise is to be found from rays that the map has not seen.
-
-Which ones moves on from scan to scan: they are not the same bearings each time.
-"""
-
-NEVER_NOTHING = 1e-10
-"""What is left of a ray stays above this: numbers near the smallest ones would slow the processor down a lot."""
-
-SPENT = 1e-5
-"""A ray is followed until no more than this chance is left that it came so far."""
-
-BEFORE, BEYOND = 0.5, 0.5
-"""The chances that a ray meets something before it comes to the grid, where its sensor stands off it; and that one
-which leaves the grid meets something before range_max."""
-
-WILD_TAIL = 0.1
-"""The share of wild measurements that read as too near, and as no return; the rest is spread over all ranges."""
+TRANSMITTANCE_FLOOR = 1e-10
+"""Added to the transmittance at each cell: denormal numbers would slow the processor down considerably."""
 
 MEASURED, TOO_NEAR, NO_RETURN = 0, 1, 2
-HITS, PASSES, CERTAIN = 0, 1, 2
-LOG_LIKELIHOOD, STOPS, SQUARES, WILD, RAYS, VISITS = range(6)
+"""What a range is, see :func:`classify_range`; also the tables' rows of weights."""
+
+CENSORED_MOMENTS = 2
+"""A table's row of second moments is this plus TOO_NEAR or NO_RETURN."""
+
+HITS, PASSES, SQUARES_OF_ARRIVAL = 0, 1, 2
+"""Columns of an E step's sums per cell."""
+
+LOG_LIKELIHOOD, STOPS, SQUARES, OUTLIERS, RAYS, VISITS = range(6)
+"""Entries of an E step's totals over rays."""
 
 ROOT_HALF = math.sqrt(0.5)
 PEAK = 1 / math.sqrt(2 * math.pi)
+"""The standard normal density at 0."""
 
 
-def tables() -> NDArray[np.float32]:
-    """Weights and second moments (5, TOP + 1) over x = (s - z) / sigma from -REACH to REACH, s where the ray stops.
+class RayModel(NamedTuple):
+    """Parameters of the forward sensor model that are not estimated; all set by hand.
 
-    Rows MEASURED, TOO_NEAR, NO_RETURN: the measurement's weight. exp(-x^2 / 2) for a range z; Phi(-x) for one that
-    read less than z = range_min; Phi(x) for more than z = range_max. Rows 3 and 4: the second moment of the noise,
-    in sigma^2, given that a range is cut off below or above (moments of the truncated normal distribution).
+    Attributes:
+        hit_before: Probability that a ray from a sensor off the grid ends before it reaches the grid.
+        hit_beyond: Probability that a ray that leaves the grid ends before range_max.
+        outlier_tail: Share of outliers that read as nearer than range_min, and the share that read as no return; the
+            rest is uniform over the sensor's ranges.
+        transmittance_cutoff: A ray is traced until the probability that it came so far falls below this.
+    """
+
+    hit_before: float = 0.5
+    hit_beyond: float = 0.5
+    outlier_tail: float = 0.1
+    transmittance_cutoff: float = 1e-5
+
+
+class SensorModel(NamedTuple):
+    """The forward sensor model's parameters as the kernels take them.
+
+    Attributes:
+        sigma: Standard deviation of the range noise (m; in cells inside the kernels).
+        epsilon: Share of outliers.
+        rays: The parameters that are not estimated.
+        table: The tables made by :func:`noise_tables`.
+    """
+
+    sigma: float
+    epsilon: float
+    rays: RayModel
+    table: NDArray[np.float32]
+
+
+class RayArrays(NamedTuple):
+    """Rays in the order of their scans.
+
+    Attributes:
+        scans: Per scan (S, 4) float64: the sensor's x, y, range_min and range_max (m).
+        first: Index (S + 1,) of each scan's first ray, and the number of rays.
+        rays: Per ray (N, 3) float32: the direction in the map frame, and the range (m; -inf: nearer than range_min,
+            inf: no return).
+    """
+
+    scans: FloatArray
+    first: NDArray[np.int64]
+    rays: NDArray[np.float32]
+
+
+class RaySlice(NamedTuple):
+    """The rays that an E step takes, as the kernel takes them.
+
+    Attributes:
+        begin: Index of the first ray.
+        end: Index after the last ray.
+        stride: Every ``stride``-th ray is taken.
+        fold: 1 leaves the held-out rays out, -1 takes only those, 0 takes all.
+        hold_out_every: Every ``hold_out_every``-th ray is held out. Which ones shifts from scan to scan, so that they
+            are not always at the same bearings.
+    """
+
+    begin: int
+    end: int
+    stride: int
+    fold: int
+    hold_out_every: int
+
+
+class GridGeometry(NamedTuple):
+    """The place of a grid in the map frame.
+
+    Attributes:
+        x: x (m) of the lower left corner.
+        y: y (m) of the lower left corner.
+        resolution: Side of a cell (m).
+    """
+
+    x: float
+    y: float
+    resolution: float
+
+
+class RayScratch(NamedTuple):
+    """Working memory for one ray: an entry for each cell that it crosses.
+
+    Attributes:
+        cells: Flat indices int64.
+        transmittance: T_k float32, the probability that the ray reaches the cell.
+        residual: (s_k - z) / sigma float32.
+        weight: float32, first T_k o_k times the likelihood of the measurement, then the responsibilities q_k.
+    """
+
+    cells: NDArray[np.int64]
+    transmittance: NDArray[np.float32]
+    residual: NDArray[np.float32]
+    weight: NDArray[np.float32]
+
+
+def noise_tables() -> NDArray[np.float32]:
+    """Tabulate the noise over x = (s - z) / sigma from -REACH to REACH, for a ray that ends at s.
+
+    Returns:
+        An array (5, TOP + 1). Rows MEASURED, TOO_NEAR and NO_RETURN are the weights of a measurement: exp(-x^2 / 2)
+        for a range z, Phi(-x) for one below z = range_min, Phi(x) for one above z = range_max. Rows 3 and 4 are the
+        second moments of the noise, in sigma^2, given that the range is censored below or above (moments of the
+        truncated normal distribution).
     """
     x = np.arange(-REACH * SPACING, REACH * SPACING + 1) / SPACING
     density = np.exp(-(x**2) / 2)
     below = np.array([0.5 * math.erfc(value * ROOT_HALF) for value in x])
     above = below[::-1]
-    cut_below = 1 + x * density * PEAK / below
-    return np.stack([density, below, above, cut_below, cut_below[::-1]]).astype(np.float32)
+    moment_below = 1 + x * density * PEAK / below
+    return np.stack([density, below, above, moment_below, moment_below[::-1]]).astype(np.float32)
 
 
 @inline
 def normal_cdf(u: float) -> float:
-    """Phi(u)."""
+    """Return the standard normal distribution function Phi(u)."""
     return 0.5 * math.erfc(-u * ROOT_HALF)
 
 
 @inline
 def normal_cdf_integral(u: float) -> float:
-    """The integral of Phi up to u."""
+    """Return the integral of Phi from minus infinity to u."""
     return u * normal_cdf(u) + PEAK * math.exp(-0.5 * u * u)
 
 
 @inline
-def looked_up(table: Any, row: int, x: float) -> float:
-    """A row of the table at x, linear between its entries."""
+def interpolate(table: Any, row: int, x: float) -> float:
+    """Interpolate a row of the tables linearly.
+
+    Args:
+        table: The tables made by :func:`noise_tables`.
+        row: The row.
+        x: Residual in standard deviations; clamped to the tables' reach.
+
+    Returns:
+        The value at x.
+    """
     place = min(max(x + REACH, 0.0), 2 * REACH) * SPACING
     entry = min(int(place), TOP - 1)
     low = float(table[row, entry])
@@ -101,71 +220,118 @@ def looked_up(table: Any, row: int, x: float) -> float:
 
 
 @inline
-def beyond(kind: int, z: float, z_min: float, z_max: float, exit_at: float, sigma: float, table: Any) -> float:
-    """The likelihood of a measurement (per cell, where it is a range) whose ray has left the grid at ``exit_at``.
+def likelihood_beyond(kind: int, z: float, z_min: float, z_max: float, exit_at: float, sensor: SensorModel) -> float:
+    """Return the likelihood E(z) of a measurement whose ray has left the grid.
 
-    What lies beyond the grid is anywhere beyond it, up to range_max: with BEYOND's chance the range is uniform over
-    that, plus noise; else there is no return.
+    Beyond the grid the ray ends with probability ``hit_beyond`` anywhere up to range_max, uniformly, plus noise; else
+    there is no return.
+
+    Args:
+        kind: MEASURED, TOO_NEAR or NO_RETURN.
+        z: The range (cells).
+        z_min: range_min (cells).
+        z_max: range_max (cells).
+        exit_at: Distance at which the ray leaves the grid (cells).
+        sensor: The sensor model, in cells.
+
+    Returns:
+        A density (per cell) for a measured range, else a probability.
     """
+    sigma, hit = sensor.sigma, sensor.rays.hit_beyond
     if exit_at >= z_max:
         return 1.0 if kind == NO_RETURN else 0.0
     span = z_max - exit_at
     if kind == MEASURED:
-        return (
-            BEYOND
-            * (looked_up(table, NO_RETURN, (z - exit_at) / sigma) - looked_up(table, NO_RETURN, (z - z_max) / sigma))
-            / span
-        )
+        above = interpolate(sensor.table, NO_RETURN, (z - exit_at) / sigma)
+        return hit * (above - interpolate(sensor.table, NO_RETURN, (z - z_max) / sigma)) / span
     if kind == TOO_NEAR:
         near = normal_cdf_integral((z_min - exit_at) / sigma) - normal_cdf_integral((z_min - z_max) / sigma)
-        return BEYOND * sigma * near / span
+        return hit * sigma * near / span
     far = normal_cdf_integral(span / sigma) - PEAK
-    return 1 - BEYOND * sigma * far / span
+    return 1 - hit * sigma * far / span
 
 
 @inline
-def before(kind: int, z: float, z_min: float, z_max: float, entry: float, sigma: float, table: Any) -> float:
-    """The likelihood of a measurement whose ray was stopped before it came to the grid at ``entry``, as beyond.
+def likelihood_before(kind: int, z: float, z_min: float, z_max: float, entry: float, sensor: SensorModel) -> float:
+    """Return the likelihood B(z) of a measurement whose ray ends before it enters the grid.
 
-    What lies between a sensor off the grid and the grid is anywhere there.
+    Between a sensor off the grid and the grid the ray ends with probability ``hit_before``, uniformly, plus noise.
+
+    Args:
+        kind: MEASURED, TOO_NEAR or NO_RETURN.
+        z: The range (cells).
+        z_min: range_min (cells).
+        z_max: range_max (cells).
+        entry: Distance at which the ray enters the grid (cells); 0 where the sensor is inside.
+        sensor: The sensor model, in cells.
+
+    Returns:
+        A density (per cell) for a measured range, else a probability.
     """
+    sigma, hit = sensor.sigma, sensor.rays.hit_before
     if entry <= 0:
         return 0.0
     if kind == MEASURED:
-        return (
-            BEFORE
-            * (looked_up(table, NO_RETURN, z / sigma) - looked_up(table, NO_RETURN, (z - entry) / sigma))
-            / entry
-        )
+        above = interpolate(sensor.table, NO_RETURN, z / sigma)
+        return hit * (above - interpolate(sensor.table, NO_RETURN, (z - entry) / sigma)) / entry
     limit = z_min if kind == TOO_NEAR else z_max
     nearer = sigma * (normal_cdf_integral(limit / sigma) - normal_cdf_integral((limit - entry) / sigma)) / entry
-    return BEFORE * nearer if kind == TOO_NEAR else BEFORE * max(1 - nearer, 0.0)
+    return hit * nearer if kind == TOO_NEAR else hit * max(1 - nearer, 0.0)
 
 
 @inline
-def wild(kind: int, z_min: float, z_max: float) -> float:
-    """The likelihood of a measurement that has nothing to do with the map."""
-    return (1 - 2 * WILD_TAIL) / (z_max - z_min) if kind == MEASURED else WILD_TAIL
+def outlier_likelihood(kind: int, z_min: float, z_max: float, outlier_tail: float) -> float:
+    """Return the likelihood O(z) of an outlier: a measurement that does not depend on the map.
+
+    Args:
+        kind: MEASURED, TOO_NEAR or NO_RETURN.
+        z_min: range_min (cells).
+        z_max: range_max (cells).
+        outlier_tail: Share of outliers at each end of the sensor's ranges.
+
+    Returns:
+        A density (per cell) for a measured range, else a probability.
+    """
+    return (1 - 2 * outlier_tail) / (z_max - z_min) if kind == MEASURED else outlier_tail
 
 
 @inline
-def first_inside(offset: int, tilt: int, cells: int) -> tuple[int, int]:
-    """First and last step for which 0 <= (offset + step * tilt) >> SHIFT < cells; none where the first is larger."""
+def steps_inside(offset: int, slope: int, cells: int) -> tuple[int, int]:
+    """Return the steps for which a ray's minor coordinate is within the grid.
+
+    Args:
+        offset: The minor coordinate at step 0, fixed point.
+        slope: Its change per step, fixed point.
+        cells: The grid's number of cells along the minor axis.
+
+    Returns:
+        First and last step for which 0 <= (offset + step * slope) >> SHIFT < cells; no step is where the first is
+        larger.
+    """
     end = (cells << SHIFT) - 1
-    if tilt == 0:
+    if slope == 0:
         return (0, 1 << 40) if 0 <= offset <= end else (1, 0)
-    if tilt < 0:
-        offset, tilt = end - offset, -tilt
-    return -(offset // tilt), (end - offset) // tilt
+    if slope < 0:
+        offset, slope = end - offset, -slope
+    return -(offset // slope), (end - offset) // slope
 
 
 @inline
-def lay(x: float, y: float, dx: float, dy: float, rows: int, cols: int) -> tuple[Any, ...]:
-    """A ray from (x, y) along (dx, dy), in cells of the grid: one cell per step along its major axis.
+def cells_along_ray(x: float, y: float, dx: float, dy: float, rows: int, cols: int) -> tuple[Any, ...]:
+    """Return the cells that a ray crosses: one for each step along its major axis, by the exact sensor position.
 
-    Returns first and last step within the grid, flat index of step 0 (along the major axis only), major stride,
-    minor stride, the minor coordinate's fixed-point offset and tilt, the distance of step 0 (may be below 0: only
-    steps ahead of the sensor are returned) and between steps.
+    Args:
+        x: The sensor's x relative to the grid (cells).
+        y: The sensor's y relative to the grid (cells).
+        dx: x of the ray's direction.
+        dy: y of the ray's direction.
+        rows: The grid's rows.
+        cols: The grid's columns.
+
+    Returns:
+        First and last step within the grid (only steps ahead of the sensor); the flat index of step 0 by its major
+        coordinate alone; the strides along the major and the minor axis; the minor coordinate at step 0 and its
+        change per step, in fixed point; the distance of step 0 (may be below 0) and between steps (cells).
     """
     along_x = abs(dx) >= abs(dy)
     if along_x:
@@ -175,66 +341,90 @@ def lay(x: float, y: float, dx: float, dy: float, rows: int, cols: int) -> tuple
     step = 1 / abs(da)
     cell = math.floor(a)
     start = (cell + 0.5 - a) * step if da > 0 else (a - cell - 0.5) * step
-    tilt = int(db * step * ONE)
+    slope = int(db * step * ONE)
     offset = math.floor((b + start * db) * ONE)
-    first, last = first_inside(offset, tilt, b_cells)
+    first, last = steps_inside(offset, slope, b_cells)
     if da > 0:
         first, last, major = max(first, -cell), min(last, a_cells - 1 - cell), a_stride
     else:
         first, last, major = max(first, cell - a_cells + 1), min(last, cell), -a_stride
     first = max(first, 0 if start > 0 else 1)
-    return first, last, cell * a_stride, major, b_stride, offset, tilt, start, step
+    return first, last, cell * a_stride, major, b_stride, offset, slope, start, step
 
 
 part = compiled(cache=False, forceinline=True)
-"""A part of the kernels below."""
+"""Decorator for a part of the kernels below."""
 
 fused = compiled(cache=False, forceinline=True, fastmath={"contract"})
-"""Multiplication and addition in one step."""
+"""Decorator for a part that may fuse a multiplication and an addition."""
 
 fast = compiled(cache=False, forceinline=True, fastmath={"nsz", "contract", "reassoc", "nnan"})
-"""Sums in any order, so that they can be taken eight at a time."""
+"""Decorator for a part that may also reorder sums, so that they are vectorised."""
 
 
 @fused
-def walk(
-    line: Any, stop: int, left: Any, x_start: Any, x_step: Any, flat: Any, where: Any, chance: Any, apart: Any
+def traverse(
+    line: Any, stop: int, left: Any, cutoff: float, x_start: Any, x_step: Any, flat: Any, scratch: RayScratch
 ) -> Any:
-    """Follows a ray until it is spent or at step ``stop``; returns how many cells it came to, and what is left of it.
+    """Traverse a ray's cells until its transmittance is below the cutoff or a step is reached.
 
-    ``left`` is the chance that it comes to the first.
+    The transmittance is compared with the cutoff after every CHUNK cells only: a test at each cell would stall the
+    cells that follow.
 
-    Fills, for each cell: ``where`` (flat index), ``chance`` (to come that far), ``apart`` ((s - z) / sigma). Whether
-    the ray is spent is looked up after every CHUNK cells: a test at each would hold up all that follows it.
+    Args:
+        line: First step, flat index of step 0, strides, fixed-point offset and slope, see :func:`cells_along_ray`.
+        stop: Last step.
+        left: Transmittance T at the first step.
+        cutoff: The transmittance's cutoff.
+        x_start: Residual (s - z) / sigma at step 0.
+        x_step: Its change per step.
+        flat: Stopping probabilities (rows * cols,).
+        scratch: Its ``cells``, ``transmittance`` and ``residual`` are filled.
+
+    Returns:
+        The number of cells, and the transmittance after the last one.
     """
-    first, start, major, minor, offset, tilt = line
+    first, start, major, minor, offset, slope = line
+    cells, transmittance, residual = scratch.cells, scratch.transmittance, scratch.residual
     count = 0
     step = first
-    c, along = start + first * major, offset + first * tilt
-    while step <= stop and left >= SPENT:
+    c, along = start + first * major, offset + first * slope
+    while step <= stop and left >= cutoff:
         for k in range(min(CHUNK, stop + 1 - step)):
             n = np.uintp(count + k)
             here = c + (along >> SHIFT) * minor
-            where[n] = here
-            chance[n] = left
-            apart[n] = x_start + np.float32(np.int32(step + k)) * x_step
-            left = left * (np.float32(1) - flat[np.uintp(here)]) + np.float32(NEVER_NOTHING)
+            cells[n] = here
+            transmittance[n] = left
+            residual[n] = x_start + np.float32(np.int32(step + k)) * x_step
+            left = left * (np.float32(1) - flat[np.uintp(here)]) + np.float32(TRANSMITTANCE_FLOOR)
             c += major
-            along += tilt
+            along += slope
         count += min(CHUNK, stop + 1 - step)
         step += CHUNK
     return count, left
 
 
 @fast
-def weigh_range(count: int, where: Any, chance: Any, apart: Any, flat: Any, share: Any) -> Any:
-    """``share``: chance to stop in each cell, times exp(-x^2 / 2) (to 5e-4 of it); returns their sum."""
+def weight_measured(count: int, flat: Any, scratch: RayScratch) -> Any:
+    """Weight a ray's cells by a measured range: T_k o_k exp(-x_k^2 / 2), the exponential to 5e-4 of itself.
+
+    exp(-x^2 / 2) = exp(-t)^256 with t = x^2 / 512, and a polynomial for exp(-t).
+
+    Args:
+        count: The number of cells.
+        flat: Stopping probabilities (rows * cols,).
+        scratch: Its ``weight`` is filled.
+
+    Returns:
+        The sum of the weights.
+    """
+    cells, transmittance, residual, weight = scratch.cells, scratch.transmittance, scratch.residual, scratch.weight
     for i in range(count):
-        share[np.uintp(i)] = flat[np.uintp(where[np.uintp(i)])]
+        weight[np.uintp(i)] = flat[np.uintp(cells[np.uintp(i)])]
     total = np.float32(0)
     for i in range(count):
         n = np.uintp(i)
-        x = apart[n]
+        x = residual[n]
         t = x * x * np.float32(1 / 512)
         u = min(t, np.float32(CUT))
         w = np.float32(1) - u * (np.float32(1) - u * (np.float32(0.5) - u * np.float32(1 / 6)))
@@ -246,148 +436,250 @@ def weigh_range(count: int, where: Any, chance: Any, apart: Any, flat: Any, shar
         w *= w
         w *= w
         w *= w
-        part = chance[n] * share[n] * (w if t < np.float32(CUT) else np.float32(0))
-        share[n] = part
+        part = transmittance[n] * weight[n] * (w if t < np.float32(CUT) else np.float32(0))
+        weight[n] = part
         total += part
     return total
 
 
 @part
-def weigh_cut(row: int, count: int, where: Any, chance: Any, apart: Any, flat: Any, table: Any, share: Any) -> Any:
-    """As weigh_range, for a measurement that was cut off at one end of the sensor's range: weights from a table."""
+def weight_censored(row: int, count: int, flat: Any, table: Any, scratch: RayScratch) -> Any:
+    """Weight a ray's cells by a censored measurement: T_k o_k times the probability of the tail, from the tables.
+
+    Args:
+        row: TOO_NEAR or NO_RETURN.
+        count: The number of cells.
+        flat: Stopping probabilities (rows * cols,).
+        table: The tables.
+        scratch: Its ``weight`` is filled.
+
+    Returns:
+        The sum of the weights.
+    """
+    cells, transmittance, residual, weight = scratch.cells, scratch.transmittance, scratch.residual, scratch.weight
     total = np.float32(0)
     for i in range(count):
         n = np.uintp(i)
-        part = chance[n] * flat[np.uintp(where[n])] * np.float32(looked_up(table, row, apart[n]))
-        share[n] = part
+        part = transmittance[n] * flat[np.uintp(cells[n])] * np.float32(interpolate(table, row, residual[n]))
+        weight[n] = part
         total += part
     return total
 
 
 @fast
-def moments(count: int, factor: Any, share: Any, apart: Any) -> Any:
-    """Turns shares into responsibilities in place; returns their sum and the sum of their x^2."""
+def moments_measured(count: int, factor: Any, scratch: RayScratch) -> Any:
+    """Turn weights into responsibilities, in place, and sum them up.
+
+    Args:
+        count: The number of cells.
+        factor: Responsibility per weight.
+        scratch: Its ``weight`` is scaled.
+
+    Returns:
+        The sums of q_k and of q_k x_k^2.
+    """
+    residual, weight = scratch.residual, scratch.weight
     stops, squares = np.float32(0), np.float32(0)
     for i in range(count):
         n = np.uintp(i)
-        q = share[n] * factor
-        share[n] = q
+        q = weight[n] * factor
+        weight[n] = q
         stops += q
-        squares += q * apart[n] * apart[n]
+        squares += q * residual[n] * residual[n]
     return stops, squares
 
 
 @part
-def moments_cut(row: int, count: int, factor: Any, share: Any, apart: Any, table: Any) -> Any:
-    """As moments, with the noise's second moment from a table."""
+def moments_censored(row: int, count: int, factor: Any, table: Any, scratch: RayScratch) -> Any:
+    """Turn weights into responsibilities, in place, with the second moments of censored noise from the tables.
+
+    Args:
+        row: The tables' row of second moments.
+        count: The number of cells.
+        factor: Responsibility per weight.
+        table: The tables.
+        scratch: Its ``weight`` is scaled.
+
+    Returns:
+        The sums of q_k and of q_k times the second moment.
+    """
+    residual, weight = scratch.residual, scratch.weight
     stops, squares = np.float32(0), np.float32(0)
     for i in range(count):
         n = np.uintp(i)
-        q = share[n] * factor
-        share[n] = q
+        q = weight[n] * factor
+        weight[n] = q
         stops += q
-        squares += q * np.float32(looked_up(table, row, apart[n]))
+        squares += q * np.float32(interpolate(table, row, residual[n]))
     return stops, squares
 
 
 @part
-def scatter(count: int, behind: Any, share: Any, where: Any, sums: Any, certain: bool) -> None:
-    """Adds a ray's responsibilities to its cells, from the last one back; ``behind`` is what lies beyond them."""
+def scatter(count: int, behind: Any, scratch: RayScratch, sums: Any, with_certainty: bool) -> None:
+    """Add a ray's responsibilities to its cells, from the last one back.
+
+    Args:
+        count: The number of cells.
+        behind: Responsibility of what lies behind the last cell.
+        scratch: The ray's ``cells`` and responsibilities.
+        sums: Changed in place, see :func:`expect`.
+        with_certainty: Whether the third column of ``sums`` is filled.
+    """
+    cells, responsibility = scratch.cells, scratch.weight
     for i in range(count - 1, -1, -1):
         n = np.uintp(i)
-        c = np.uintp(where[n])
-        q = share[n]
+        c = np.uintp(cells[n])
+        q = responsibility[n]
         sums[c, HITS] += q
         sums[c, PASSES] += behind
         behind += q
-        if certain:
-            sums[c, CERTAIN] += behind * behind
+        if with_certainty:
+            sums[c, SQUARES_OF_ARRIVAL] += behind * behind
 
 
 @inline
-def measured(z: float, z_min: float, z_max: float, spread: float) -> tuple[int, float, float]:
-    """What was measured: its kind, the range that it tells of, and how far the ray can have come at most."""
+def classify_range(z: float, z_min: float, z_max: float, sigma: float) -> tuple[int, float, float]:
+    """Classify a range; -inf is nearer than range_min (REP 117).
+
+    Args:
+        z: The range (cells).
+        z_min: range_min (cells).
+        z_max: range_max (cells).
+        sigma: Standard deviation of the noise (cells).
+
+    Returns:
+        MEASURED, TOO_NEAR or NO_RETURN; the distance that the noise is measured from; and the distance beyond which
+        the ray cannot have ended, or (no return) is not followed.
+    """
     if z == -math.inf:
-        return TOO_NEAR, z_min, z_min + REACH * spread
+        return TOO_NEAR, z_min, z_min + REACH * sigma
     if z >= z_max:
         return NO_RETURN, z_max, z_max
-    return MEASURED, z, z + REACH * spread
+    return MEASURED, z, z + REACH * sigma
 
 
 @inline
-def is_chosen(number: Any, stride: int, held_out: int) -> bool:
-    """Whether a pass takes a ray: every ``stride``-th, of those held out (-1), of the others (1), or of all (0)."""
-    return number % stride == 0 and (held_out == 0 or (number % HOLD_OUT == 0) == (held_out < 0))
+def is_selected(number: Any, subset: RaySlice) -> bool:
+    """Return whether an E step takes a ray.
+
+    Args:
+        number: Index of the ray plus that of its scan.
+        subset: The rays that it takes.
+
+    Returns:
+        Whether the ray is one of them.
+    """
+    is_held_out = number % subset.hold_out_every == 0
+    return number % subset.stride == 0 and (subset.fold == 0 or is_held_out == (subset.fold < 0))
 
 
 @part
-def follow(
-    x: float,
-    y: float,
-    beam: Any,
-    limits: Any,
-    stopping: Any,
-    lead: int,
-    spread: float,
-    epsilon: float,
-    table: Any,
-    where: Any,
-    chance: Any,
-    apart: Any,
-    share: Any,
+def trace_ray(
+    ray: Any, limits: Any, stopping: Any, skip: int, sensor: SensorModel, scratch: RayScratch
 ) -> tuple[Any, ...]:
-    """One ray from (x, y): what it crosses, and how likely what it measured is.
+    """Trace one ray through the grid and compute the density of its measurement.
 
-    ``beam`` is its direction and range (-inf: nearer than range_min, inf: no return), ``limits`` are range_min and
-    range_max, ``lead`` is how many of its first cells are passed over. Fills ``where``, ``chance``, ``apart`` (as
-    :func:`walk`) and ``share`` (as :func:`weigh_range`).
+    Args:
+        ray: x and y of the sensor, the direction, and the range (-inf: nearer than range_min, inf: no return).
+        limits: range_min and range_max.
+        stopping: Stopping probabilities (rows, cols).
+        skip: Number of the ray's first cells that are skipped.
+        sensor: The sensor model. All lengths are in cells.
+        scratch: Filled, with weights.
 
-    Returns what was measured, how many cells it came to (-1: it misses the grid), the factor of their shares in the
-    density, the likelihood of what lies beyond them, that of a wild measurement, and the density of them all.
+    Returns:
+        MEASURED, TOO_NEAR or NO_RETURN; the number of cells (-1 where the ray misses the grid); the factor of the
+        weights in the density; the likelihoods of what lies behind the cells and of an outlier (with its share); and
+        the density of the measurement.
     """
     rows, cols = stopping.shape
     flat = stopping.reshape(-1)
+    x, y, dx, dy, measurement = ray
     z_min, z_max = limits
-    inverse_spread = 1 / spread
+    sigma, epsilon, cutoff = sensor.sigma, sensor.epsilon, sensor.rays.transmittance_cutoff
+    inverse_sigma = 1 / sigma
     if not (-FAR_CELLS < x < cols + FAR_CELLS and -FAR_CELLS < y < rows + FAR_CELLS):
         return 0, -1, 0.0, 0.0, 0.0, 1.0
-    first, last, start, major, minor, offset, tilt, s0, ds = lay(x, y, beam[0], beam[1], rows, cols)
+    first, last, start, major, minor, offset, slope, s0, ds = cells_along_ray(x, y, dx, dy, rows, cols)
     if first > last:
         return 0, -1, 0.0, 0.0, 0.0, 1.0
-    kind, z, furthest = measured(beam[2], z_min, z_max, spread)
+    kind, z, farthest = classify_range(measurement, z_min, z_max, sigma)
     entry = 0.0 if 0 <= x < cols and 0 <= y < rows else s0 + (first - 0.5) * ds
     exit_at = s0 + (last + 0.5) * ds
-    leaves = exit_at <= furthest
-    stop = last if leaves else min(last, int((furthest - s0) / ds))
-    line = (first + lead, start, major, minor, offset, tilt)
-    x_start, x_step = np.float32((s0 - z) * inverse_spread), np.float32(ds * inverse_spread)
-    comes = np.float32(1.0 if entry <= 0 else 1 - BEFORE)
-    count, left = walk(line, stop, comes, x_start, x_step, flat, where, chance, apart)
-    gone = 0.0
-    if left >= SPENT and leaves:
-        gone = left * beyond(kind, z, z_min, z_max, exit_at, spread, table)
-    elif left >= SPENT and kind == NO_RETURN:
-        gone = float(left)
+    leaves = exit_at <= farthest
+    stop = last if leaves else min(last, int((farthest - s0) / ds))
+    line = (first + skip, start, major, minor, offset, slope)
+    x_start, x_step = np.float32((s0 - z) * inverse_sigma), np.float32(ds * inverse_sigma)
+    enters = np.float32(1.0 if entry <= 0 else 1 - sensor.rays.hit_before)
+    count, left = traverse(line, stop, enters, cutoff, x_start, x_step, flat, scratch)
+    behind = 0.0
+    if left >= cutoff and leaves:
+        behind = left * likelihood_beyond(kind, z, z_min, z_max, exit_at, sensor)
+    elif left >= cutoff and kind == NO_RETURN:
+        behind = float(left)
     if kind == MEASURED:
-        scale = PEAK * inverse_spread
-        total = weigh_range(count, where, chance, apart, flat, share)
+        scale = PEAK * inverse_sigma
+        total = weight_measured(count, flat, scratch)
     else:
         scale = 1.0
-        total = weigh_cut(kind, count, where, chance, apart, flat, table, share)
-    wildness = epsilon * wild(kind, z_min, z_max)
-    ahead = before(kind, z, z_min, z_max, entry, spread, table)
-    density = (1 - epsilon) * (total * scale + gone + ahead) + wildness
-    return kind, count, scale, gone, wildness, density
+        total = weight_censored(kind, count, flat, sensor.table, scratch)
+    outlier = epsilon * outlier_likelihood(kind, z_min, z_max, sensor.rays.outlier_tail)
+    ahead = likelihood_before(kind, z, z_min, z_max, entry, sensor)
+    density = (1 - epsilon) * (total * scale + behind + ahead) + outlier
+    return kind, count, scale, behind, outlier, density
 
 
 @inline
-def stand(pose: Any, mount: Any, nudges: Any, k: int, corner: Any, per_metre: float, place: Any) -> None:
-    """Where a laser stands (in cells) and looks (cosine, sine) from a pose (``k`` = 0), or from one that is nudged up
-    or down along x, y or the heading (1 to 6).
+def in_cells(sensor: Fields, resolution: float) -> SensorModel:
+    """Return a sensor model with lengths in cells.
+
+    Args:
+        sensor: Fields of :class:`SensorModel`, in metres, with those of :class:`RayModel`.
+        resolution: Side of a cell (m).
+
+    Returns:
+        The model, in cells.
+    """
+    sigma, epsilon, rays, table = sensor
+    return SensorModel(sigma / resolution, epsilon, RayModel(*rays), table)
+
+
+@inline
+def make_scratch(rows: int, cols: int) -> RayScratch:
+    """Return working memory for any ray through a grid.
+
+    Args:
+        rows: The grid's rows.
+        cols: The grid's columns.
+
+    Returns:
+        Arrays that are not initialised.
+    """
+    longest = rows + cols + CHUNK
+    return RayScratch(
+        np.empty(longest, np.int64),
+        np.empty(longest, np.float32),
+        np.empty(longest, np.float32),
+        np.empty(longest, np.float32),
+    )
+
+
+@inline
+def place_laser(pose: Any, mount: Any, steps: Any, k: int, grid: GridGeometry, place: Any) -> None:
+    """Compute where a laser is for a pose of the robot, or for one that is displaced along one coordinate.
+
+    Args:
+        pose: The robot's pose (3,): x, y (m), heading (rad).
+        mount: The laser's pose (3,) in the robot's frame.
+        steps: Displacements (3,) in m, m, rad.
+        k: 0 for the pose itself; 1, 3, 5 for x, y, heading increased by their step; 2, 4, 6 for them decreased.
+        grid: The grid's place.
+        place: Filled (4,): the laser's x and y relative to the grid (cells), cosine and sine of its heading.
     """
     x, y, theta = pose[0], pose[1], pose[2]
+    per_metre = 1 / grid.resolution
     if k:
-        change = nudges[(k - 1) // 2] if k % 2 else -nudges[(k - 1) // 2]
+        change = steps[(k - 1) // 2] if k % 2 else -steps[(k - 1) // 2]
         if k < 3:
             x += change
         elif k < 5:
@@ -395,181 +687,184 @@ def stand(pose: Any, mount: Any, nudges: Any, k: int, corner: Any, per_metre: fl
         else:
             theta += change
     cos, sin = math.cos(theta), math.sin(theta)
-    place[0] = (x + cos * mount[0] - sin * mount[1] - corner[0]) * per_metre
-    place[1] = (y + sin * mount[0] + cos * mount[1] - corner[1]) * per_metre
+    place[0] = (x + cos * mount[0] - sin * mount[1] - grid.x) * per_metre
+    place[1] = (y + sin * mount[0] + cos * mount[1] - grid.y) * per_metre
     place[2], place[3] = math.cos(theta + mount[2]), math.sin(theta + mount[2])
 
 
-@kernel
-def look(
-    rays: Any,
-    pose: Any,
-    mount: Any,
-    limits: Any,
-    nudges: Any,
-    corner: Any,
-    resolution: float,
-    stopping: Any,
-    sigma: float,
-    epsilon: float,
-    table: Any,
-    found: Any,
-) -> None:
-    """How likely a scan is from a robot at ``pose`` (3,), and how that changes with the pose.
+@inline
+def add_score(a: float, b: float, c: float, result: Any) -> None:
+    """Add one ray's score, and its outer product, to the result of :func:`pose_likelihood`.
 
-    ``rays`` (N, 5): where each beam starts (x, y), its direction, and its range, in the frame of the laser, which is
-    mounted on the robot at ``mount`` (3,). ``limits`` are range_min and range_max (m); ``nudges`` (3,) the steps
-    (m, m, rad) of the differences. The map is given as in :func:`expect`. Where ``nudges`` are zero the likelihood
-    alone is found.
-
-    Fills ``found`` (11,): log-likelihood, its slope (3), the information as six numbers xx, xy, xt, yy, yt, tt (sums
-    of products of single rays' slopes: Berndt, Hall, Hall and Hausman 1974), and how many rays are on the map.
+    Args:
+        a: The score's component along x.
+        b: The score's component along y.
+        c: The score's component along the heading.
+        result: Changed in place (11,).
     """
-    longest = stopping.shape[0] + stopping.shape[1] + CHUNK
-    where, share = np.empty(longest, np.int64), np.empty(longest, np.float32)
-    apart, chance = np.empty(longest, np.float32), np.empty(longest, np.float32)
-    per_metre, spread = 1 / resolution, sigma / resolution
+    result[1] += a
+    result[2] += b
+    result[3] += c
+    result[4] += a * a
+    result[5] += a * b
+    result[6] += a * c
+    result[7] += b * b
+    result[8] += b * c
+    result[9] += c * c
+
+
+@kernel
+def pose_likelihood(
+    rays: Any,
+    limits: Any,
+    placement: Any,
+    geometry: Fields,
+    stopping: Any,
+    sensor: Fields,
+    result: Any,
+) -> None:
+    """Compute the log-likelihood of a scan from a pose of the robot, its score and its information.
+
+    Derivatives are central differences. The information is the sum of products of single rays' scores (Berndt, Hall,
+    Hall and Hausman 1974). A ray that misses the grid counts as an outlier.
+
+    Args:
+        rays: (N, 5) float64, in the frame of the laser: where each beam starts (x, y), its direction, its range (m).
+        limits: range_min and range_max (m).
+        placement: The robot's pose (3,), the laser's pose in the robot's frame (3,), and the differences' steps (3,)
+            in m, m, rad; where the steps are 0 the log-likelihood alone is computed.
+        geometry: Fields of :class:`GridGeometry`.
+        stopping: Stopping probabilities (rows, cols) float32.
+        sensor: Fields of :class:`SensorModel`.
+        result: Filled (11,): log-likelihood, score (3), information xx, xy, xt, yy, yt, tt, number of rays that cross
+            the grid.
+    """
+    pose, mount, steps = placement
+    grid = GridGeometry(*geometry)
+    scratch = make_scratch(stopping.shape[0], stopping.shape[1])
+    per_metre, model = 1 / grid.resolution, in_cells(sensor, grid.resolution)
     cells = (limits[0] * per_metre, limits[1] * per_metre)
-    slope, places = np.empty(3), np.empty((7, 4))
-    found[:] = 0.0
-    looks = 7 if nudges[0] > 0 else 1
-    for k in range(looks):
-        stand(pose, mount, nudges, k, corner, per_metre, places[k])
+    score, places = np.empty(3), np.empty((7, 4))
+    result[:] = 0.0
+    evaluations = 7 if steps[0] > 0 else 1
+    for k in range(evaluations):
+        place_laser(pose, mount, steps, k, grid, places[k])
     for i in range(len(rays)):
         here = 0.0
         counts = True
-        for k in range(looks):
+        for k in range(evaluations):
             cos, sin = places[k, 2], places[k, 3]
             x = places[k, 0] + (cos * rays[i, 0] - sin * rays[i, 1]) * per_metre
             y = places[k, 1] + (sin * rays[i, 0] + cos * rays[i, 1]) * per_metre
             dx, dy = cos * rays[i, 2] - sin * rays[i, 3], sin * rays[i, 2] + cos * rays[i, 3]
-            beam = (dx, dy, rays[i, 4] * per_metre)
-            kind, count, _, _, _, density = follow(
-                x, y, beam, cells, stopping, 0, spread, epsilon, table, where, chance, apart, share
-            )
-            if count < 0:  # off the map: no likelier than what has nothing to do with it
-                kind = measured(beam[2], cells[0], cells[1], spread)[0]
-                density = epsilon * wild(kind, cells[0], cells[1])
+            ray = (x, y, dx, dy, rays[i, 4] * per_metre)
+            kind, count, _, _, _, density = trace_ray(ray, cells, stopping, 0, model, scratch)
+            if count < 0:
+                kind = classify_range(ray[4], cells[0], cells[1], model.sigma)[0]
+                density = model.epsilon * outlier_likelihood(kind, cells[0], cells[1], model.rays.outlier_tail)
             log_density = math.log(density * per_metre if kind == MEASURED else density)
             if k == 0:
                 here, counts = log_density, count >= 0
             elif k % 2:
-                slope[(k - 1) // 2] = log_density
+                score[(k - 1) // 2] = log_density
             else:
-                slope[(k - 1) // 2] = (slope[(k - 1) // 2] - log_density) / (2 * nudges[(k - 1) // 2])
-        found[0] += here
-        found[10] += counts
-        if looks > 1:
-            a, b, c = slope[0], slope[1], slope[2]
-            found[1] += a
-            found[2] += b
-            found[3] += c
-            found[4] += a * a
-            found[5] += a * b
-            found[6] += a * c
-            found[7] += b * b
-            found[8] += b * c
-            found[9] += c * c
+                score[(k - 1) // 2] = (score[(k - 1) // 2] - log_density) / (2 * steps[(k - 1) // 2])
+        result[0] += here
+        result[10] += counts
+        if evaluations > 1:
+            add_score(score[0], score[1], score[2], result)
 
 
 @kernel
 def expect(
-    scans: Any,
-    first_rays: Any,
-    rays: Any,
-    begin: int,
-    end: int,
-    stride: int,
-    held_out: int,
-    corner: Any,
-    resolution: float,
+    arrays: Fields,
+    selection: Fields,
+    geometry: Fields,
     stopping: Any,
-    leads: Any,
-    sigma: float,
-    epsilon: float,
-    table: Any,
+    skip: Any,
+    sensor: Fields,
     sums: Any,
     totals: Any,
 ) -> None:
-    """The E step over every ``stride``-th ray from ``begin`` to ``end``: adds to ``sums`` and ``totals``.
+    """Compute the E step over some rays.
 
-    ``scans`` (S, 4) float64: sensor's x, y, range_min, range_max (m); ``first_rays`` (S + 1,): where each scan's rays
-    begin in ``rays`` (N, 3) float32: direction in the plane, and range (m; -inf: nearer than range_min, inf: no
-    return). The grid ``stopping`` (rows, cols) float32, the chance of each cell to stop a ray, begins at ``corner``
-    (x, y in metres) with cells of ``resolution`` metres. ``leads`` (N,) int32, where not empty, says how many of a
-    ray's first cells may be passed over: they stop and gather nothing. ``sigma`` (m) and ``epsilon`` are the noise
-    and the share of wild measurements; ``table`` is made by :func:`tables`. A ``held_out`` of 1 leaves out every
-    HOLD_OUT-th ray, -1 takes only those, 0 takes all.
-
-    ``sums`` (rows * cols, 2 or 3) float32 gets the expected HITS and PASSES and, where it has a third column, the
-    sum of squares of the rays' chances to have come to the cell (CERTAIN). ``totals`` (6,) float64 gets
-    LOG_LIKELIHOOD, the expected STOPS, their SQUARES ((z - s)^2 in sigma^2), expected WILD, RAYS and VISITS.
+    Args:
+        arrays: Fields of :class:`RayArrays`.
+        selection: Fields of :class:`RaySlice`.
+        geometry: Fields of :class:`GridGeometry`.
+        stopping: Stopping probabilities (rows, cols) float32.
+        skip: Per ray (N,) int32 the number of its first cells that are skipped, since they stop and receive nothing;
+            empty: none.
+        sensor: Fields of :class:`SensorModel`.
+        sums: (rows * cols, 2 or 3) float32, added to: expected HITS and PASSES and, where there is a third column,
+            the sum of squares of the rays' probabilities to have reached the cell (SQUARES_OF_ARRIVAL).
+        totals: (6,) float64, added to: LOG_LIKELIHOOD, the expected number of STOPS in the grid, their SQUARES
+            ((z - s)^2 in sigma^2), the expected number of OUTLIERS, RAYS that cross the grid, and VISITS of cells.
     """
-    certain = sums.shape[1] > 2
-    longest = stopping.shape[0] + stopping.shape[1] + CHUNK
-    where, share = np.empty(longest, np.int64), np.empty(longest, np.float32)
-    apart, chance = np.empty(longest, np.float32), np.empty(longest, np.float32)
-    per_metre, spread = 1 / resolution, sigma / resolution
-    scan = np.searchsorted(first_rays, begin, side="right") - 1
-    for i in range(begin, end):
+    scans, first_rays, rays = arrays
+    subset, grid = RaySlice(*selection), GridGeometry(*geometry)
+    with_certainty = sums.shape[1] > 2
+    scratch = make_scratch(stopping.shape[0], stopping.shape[1])
+    per_metre, model = 1 / grid.resolution, in_cells(sensor, grid.resolution)
+    scan = np.searchsorted(first_rays, subset.begin, side="right") - 1
+    for i in range(subset.begin, subset.end):
         while i >= first_rays[scan + 1]:
             scan += 1
-        if not is_chosen(i + scan, stride, held_out):
+        if not is_selected(i + scan, subset):
             continue
-        x, y = (scans[scan, 0] - corner[0]) * per_metre, (scans[scan, 1] - corner[1]) * per_metre
+        x, y = (scans[scan, 0] - grid.x) * per_metre, (scans[scan, 1] - grid.y) * per_metre
         limits = (scans[scan, 2] * per_metre, scans[scan, 3] * per_metre)
-        beam = (float(rays[i, 0]), float(rays[i, 1]), float(rays[i, 2]) * per_metre)
-        lead = leads[i] if len(leads) else 0
-        kind, count, scale, gone, wildness, density = follow(
-            x, y, beam, limits, stopping, lead, spread, epsilon, table, where, chance, apart, share
-        )
+        ray = (x, y, float(rays[i, 0]), float(rays[i, 1]), float(rays[i, 2]) * per_metre)
+        skipped = skip[i] if len(skip) else 0
+        kind, count, scale, behind, outlier, density = trace_ray(ray, limits, stopping, skipped, model, scratch)
         if count < 0:
             continue
-        weight = (1 - epsilon) / density
+        weight = (1 - model.epsilon) / density
         factor = np.float32(scale * weight)
         if kind == MEASURED:
-            stops, squares = moments(count, factor, share, apart)
+            stops, squares = moments_measured(count, factor, scratch)
         else:
-            stops, squares = moments_cut(2 + kind, count, factor, share, apart, table)
-        scatter(count, np.float32(gone * weight), share, where, sums, certain)
+            stops, squares = moments_censored(CENSORED_MOMENTS + kind, count, factor, model.table, scratch)
+        scatter(count, np.float32(behind * weight), scratch, sums, with_certainty)
         totals[LOG_LIKELIHOOD] += math.log(density * per_metre if kind == MEASURED else density)
         totals[STOPS] += stops
         totals[SQUARES] += squares
-        totals[WILD] += wildness / density
+        totals[OUTLIERS] += outlier / density
         totals[RAYS] += 1
         totals[VISITS] += count
 
 
 @kernel
-def find_leads(
-    scans: Any,
-    first_rays: Any,
-    rays: Any,
-    begin: int,
-    end: int,
-    corner: Any,
-    resolution: float,
-    marked: Any,
-    leads: Any,
-) -> None:
-    """``leads`` (N,) int32: how many cells each of the rays ``begin`` to ``end`` crosses before a ``marked`` one."""
+def count_skips(arrays: Fields, begin: int, end: int, geometry: Fields, marked: Any, skip: Any) -> None:
+    """Count the cells that each ray crosses before it reaches a marked one.
+
+    Args:
+        arrays: Fields of :class:`RayArrays`.
+        begin: Index of the first ray.
+        end: Index after the last ray.
+        geometry: Fields of :class:`GridGeometry`.
+        marked: Marked cells (rows, cols) bool.
+        skip: Filled (N,) int32 for rays from ``begin`` to ``end``.
+    """
+    scans, first_rays, rays = arrays
+    grid = GridGeometry(*geometry)
     rows, cols = marked.shape
     flat = marked.reshape(-1)
     scan = np.searchsorted(first_rays, begin, side="right") - 1
     for i in range(begin, end):
         while i >= first_rays[scan + 1]:
             scan += 1
-        x, y = (scans[scan, 0] - corner[0]) / resolution, (scans[scan, 1] - corner[1]) / resolution
-        leads[i] = 0
+        x, y = (scans[scan, 0] - grid.x) / grid.resolution, (scans[scan, 1] - grid.y) / grid.resolution
+        skip[i] = 0
         if not (-FAR_CELLS < x < cols + FAR_CELLS and -FAR_CELLS < y < rows + FAR_CELLS):
             continue
-        first, last, start, major, minor, offset, tilt, _, _ = lay(
+        first, last, start, major, minor, offset, slope, _, _ = cells_along_ray(
             x, y, float(rays[i, 0]), float(rays[i, 1]), rows, cols
         )
         step = first
-        c, along = start + first * major, offset + first * tilt
+        c, along = start + first * major, offset + first * slope
         while step <= last and not flat[np.uintp(c + (along >> SHIFT) * minor)]:
             step += 1
             c += major
-            along += tilt
-        leads[i] = max(step - first, 0)
+            along += slope
+        skip[i] = max(step - first, 0)

@@ -1,9 +1,20 @@
-"""The forward mapper: a sensor model fitted to all rays by expectation-maximisation (idea: Thrun 2003).
+"""The forward mapper: a forward sensor model fitted to all rays by expectation-maximisation (after Thrun 2003).
 
-Each cell has a chance to stop a ray that enters it. The map is the one, and the noise the one, that make the measured
-ranges most likely: cells are not asked one by one whether a range speaks for them, so that the map stays sharp where
-the noise is far larger than a cell. ``likelihood`` holds the model, ``sieve`` its prior, ``level`` one
-pass; this file says in which order, and ``calibration`` turns the fit into probabilities of occupancy.
+The map is a field of stopping probabilities o_c, one per cell: the probability that a ray that enters the cell ends
+there. Map and range noise (sigma, epsilon) maximise the likelihood of all measured ranges together. An inverse sensor
+model updates each cell on its own and blurs the map by the noise; here the map stays sharp where the noise is far
+larger than a cell.
+
+:mod:`~mapping.forward.likelihood` is the sensor model and the E step, :mod:`~mapping.forward.sieve` the prior and the
+M step, :mod:`~mapping.forward.level` both on one resolution. This module is the schedule:
+
+- :meth:`ForwardMapper.fit`: over-relaxed expectation-maximisation (Salakhutdinov and Roweis 2003) from coarse to
+  fine; then the range noise from held-out rays, since a map also fits a part of the noise of its own rays; then the
+  map from all rays.
+- :class:`StreamingMap`: stepwise expectation-maximisation (Cappé and Moulines 2009) on a coarser map, while scans
+  stream in.
+
+:mod:`~mapping.forward.calibration` turns a fit into probabilities of occupancy.
 """
 
 from __future__ import annotations
@@ -18,104 +29,65 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from mapping.forward.calibration import occupancy
+from mapping.forward.calibration import CALIBRATION, CalibrationOptions, occupancy
 from mapping.forward.level import (
-    ALL,
+    ALL_RAYS,
     COLUMNS,
-    NEGLIGIBLE,
-    Choice,
+    Fold,
     Level,
-    Noise,
-    Rays,
-    Totals,
-    cells_within,
-    evidence_of,
+    RangeNoise,
+    RayStore,
+    RaySubset,
+    SufficientStatistics,
+    coarse_cell_index,
+    evidence_and_certainty,
     smoothing_width,
 )
-from mapping.grid import UNKNOWN, GridFrame, Layer, OccupancyGrid
-from mapping.kernels import end_extent
+from mapping.forward.options import DEFAULTS, ForwardOptions
+from mapping.grid import UNKNOWN, GridFrame, GrowingGrid, OccupancyGrid
+from mapping.kernels import hit_extent, scan_arrays
 from prim.errors import UsageError
 from prim.scan import Scan
 from prim.se2 import Pose2D
 from prim.world import Bounds
 
-START = 0.02
-"""The chance of every cell to stop a ray, before there is any measurement."""
-
-TOLERANCE, COARSE_TOLERANCE = 5e-4, 2e-3
-"""A level has converged when a pass raises the mean log-likelihood of a ray by less: the last one, and the others."""
-
-COARSEST = 8
-"""The largest factor between the first level's cells and the map's."""
-
-PASSES = {1: 6, 2: 10, 4: 16, 8: 16}
-"""At most so many passes on the level whose cells are larger by a factor."""
-
-POWER = 3
-"""How often a pass multiplies the odds of a cell by their ratio: over-relaxation, taken back where it overshoots."""
-
-MOST_START = 2.0
-"""The fit begins with no less noise than neighbouring beams show, and with no more than this many times as much."""
-
-THIN_RAYS = 20_000
-THIN_STRIDE, HALF_STRIDE = 4, 2
-"""Of more rays, the coarsest level takes every fourth and the next ones every second, until the last passes."""
-
-LAST_PASSES = 3
-"""At most so many passes over all rays, at the end."""
-
-HELD_OUT_PASSES = 3
-HELD_OUT_RAYS = 1000
-"""The noise is found from rays that the map has not seen, unless there are fewer than this."""
-
-SIEVE_SPREAD = 3.5
-"""The sieve blurs the map, which takes about this many times its variance from the noise found (docs/forward.md)."""
-
-LEAST_GIVEN = 0.3
-"""Noise that is given counts as this many cells at least: a cell's centre is no nearer to the surface in it."""
-
-MOST_CELLS = 50_000_000
-NOISE_CELLS = 4_000_000
-"""The largest map, and the largest on which only the noise is looked for."""
-
-REVISITED = 256
-"""While streaming, this many older rays are looked at again with each scan."""
-
-STREAM_CELLS = 120_000
-"""While streaming, the map is kept at half the resolution, or coarser where it would have more cells."""
-
 
 @dataclass(frozen=True, slots=True)
-class Fit:
-    """What the forward model found, all arrays (rows, cols) float32.
+class ForwardFit:
+    """A fit of the forward model; all arrays (rows, cols) float32.
 
-    ``stopping``: each cell's chance to stop a ray that enters it; ``evidence``: how many rays came to it, expected
-    hits and passes; ``certainty``: the mean over those of the chance that they came.
+    Attributes:
+        frame: Where the cells lie.
+        stopping: Stopping probabilities.
+        evidence: Expected number of rays that reached the cell: hits and passes.
+        certainty: Mean probability, over those, to have reached the cell.
+        noise: The range noise.
     """
 
     frame: GridFrame
     stopping: NDArray[np.float32]
     evidence: NDArray[np.float32]
     certainty: NDArray[np.float32]
-    noise: Noise
+    noise: RangeNoise
 
-    def grid(self) -> OccupancyGrid:
-        """The calibrated probabilities of occupancy."""
-        spread = self.noise.std / self.frame.resolution
-        return OccupancyGrid(
-            self.frame, occupancy(self.stopping, self.certainty, self.evidence, spread), self.evidence
-        )
+    def grid(self, options: CalibrationOptions = CALIBRATION) -> OccupancyGrid:
+        """Return the calibrated probabilities of occupancy."""
+        noise_cells = self.noise.std / self.frame.resolution
+        probability = occupancy(self.stopping, self.certainty, self.evidence, noise_cells, options)
+        return OccupancyGrid(self.frame, probability, self.evidence)
 
 
 class ForwardMapper:
-    """Fits the chance of every cell to stop a ray, and the sensor's noise, to all rays together.
+    """Mapper that fits stopping probabilities and the range noise to all rays together.
 
-    ``noise_std`` (m) fixes the noise; else it is found from the rays, whatever ``start_std`` it is told to begin with
-    (by default what neighbouring beams show). Bounds as in :class:`mapping.deterministic.DeterministicMapper`.
-    ``threads`` work side by side (by default one for each core) and give the same bits in any number.
+    While scans stream in, :meth:`update` keeps a coarser map up to date with a bounded amount of work per scan, and
+    :meth:`grid` returns that one. :meth:`finish` fits all rays from coarse to fine until convergence; its result does
+    not depend on the streaming map, nor on the number of threads.
 
-    While scans stream in, a coarser map (of at most ``stream_cells``) is kept up to date with a bounded amount of
-    work for each; ``grid()`` is made of it, ``finish()`` fits from coarse to fine until TOLERANCE or PASSES.
+    Attributes:
+        resolution: Side of a cell (m).
+        options: The mapper's options.
+        history: Of the last fit, per pass the level's factor and the E step's statistics.
     """
 
     name = "forward"
@@ -127,296 +99,385 @@ class ForwardMapper:
         noise_std: float | None = None,
         start_std: float | None = None,
         threads: int | None = None,
-        stream_cells: int = STREAM_CELLS,
+        options: ForwardOptions = DEFAULTS,
     ) -> None:
+        """Start with an empty map.
+
+        Args:
+            resolution: Side of a cell (m).
+            bounds: x0, y0, x1, y1 (m) of the map; None: it grows with the scans.
+            noise_std: Standard deviation of the range noise (m), held fixed; None: it is estimated.
+            start_std: Its initial value (m) where it is estimated; None: what neighbouring beams show.
+            threads: Number of threads; None: one for each available core.
+            options: The mapper's options.
+
+        Raises:
+            UsageError: Where the noise is not above 0, or the map too large.
+        """
         self.resolution = resolution
+        self.options = options
         if noise_std is not None and not 0 < noise_std < math.inf:
             raise UsageError(f"the noise is {noise_std:g}: it must be above 0")
-        self._layer = Layer(resolution, bounds, 0, np.uint8)
-        check_size(self._layer.frame)
-        self._fixed = noise_std
-        self._start = start_std
-        self._rays = Rays()
+        self._cells = GrowingGrid(resolution, bounds, 0, np.uint8)
+        check_size(self._cells.frame, options)
+        self._fixed_std = noise_std
+        self._start_std = start_std
+        self._rays = RayStore(options.max_range)
         self._threads = threads or cores()
-        self._stream_cells = stream_cells
-        self._stream: Stream | None = None
-        self._noise = Noise(noise_std or start_std or 10 * resolution)
-        self._learned = False
-        self.history: list[tuple[int, Totals]] = []
+        self._streaming: StreamingMap | None = None
+        start = noise_std or start_std or options.default_noise_cells * resolution
+        self._noise = RangeNoise(start, options.min_outlier_share)
+        self._is_estimated = False
+        self.history: list[tuple[int, SufficientStatistics]] = []
 
     @property
     def noise_std(self) -> float | None:
-        """The noise (m) that was given, or found so far; None where too few rays were stopped to find it.
+        """Standard deviation of the range noise (m), given or estimated; None where too few rays stopped.
 
-        What the sieve takes from it is added to what the fit sees. Noise that is smaller than a cell cannot be told
-        from the cell: up to about 0.6 of its side is found where there is none.
+        The variance that the sieve takes from the estimate is added back. Noise below about 0.6 cells cannot be
+        separated from the cells' size: that much is estimated where there is none.
         """
-        if self._fixed is not None:
-            return self._fixed
-        if not self._learned:
+        if self._fixed_std is not None:
+            return self._fixed_std
+        if not self._is_estimated:
             return None
-        width = smoothing_width(self._noise.std, self.resolution)
-        share = SIEVE_SPREAD * width**2 if width >= 0.3 * self.resolution else 0.0
-        return math.sqrt(self._noise.std**2 + share)
+        options = self.options
+        width = smoothing_width(self._noise.std, self.resolution, options)
+        is_smoothed = width >= options.min_smoothing_cells * self.resolution
+        return math.sqrt(self._noise.std**2 + (options.sieve_variance * width**2 if is_smoothed else 0.0))
 
     @property
-    def wild_share(self) -> float:
-        """The share of measurements that have nothing to do with the map."""
-        return self._noise.wild
+    def outlier_share(self) -> float:
+        """Share of outliers among the measurements."""
+        return self._noise.outlier_share
 
     def update(self, scan: Scan, pose: Pose2D) -> None:
-        """Adds one scan, or the next part of one, taken by a laser at ``pose`` in the map frame.
+        """Add one scan, or the next piece of one; the streaming map takes up further pieces with the next scan.
 
-        The map so far takes up further parts with the next scan.
+        Args:
+            scan: The scan.
+            pose: Pose of the laser in the map frame.
         """
-        if not self.keep(scan, pose) or scan.first_beam:
+        if not self.accumulate(scan, pose) or scan.first_beam:
             return
-        frame = self._stream_frame()
-        if self._stream is None:
-            self._noise = self._first_noise(frame.resolution)
-        if self._stream is None or self._stream.level.frame != frame:
-            self._stream = Stream(frame, self._stream)
-        self._noise = self._stream.take(self._rays, self._noise, self._fixed is not None)
-        self._learned = self._learned or self._stream.learned
+        frame = self._streaming_frame()
+        if self._streaming is None:
+            self._noise = self._initial_noise(frame.resolution)
+        if self._streaming is None or self._streaming.level.frame != frame:
+            self._streaming = StreamingMap(frame, self._streaming, self.options)
+        self._noise = self._streaming.step(self._rays, self._noise, self._fixed_std is not None)
+        self._is_estimated = self._is_estimated or self._streaming.determines_noise
 
-    def keep(self, scan: Scan, pose: Pose2D) -> bool:
-        """Keeps a scan for :meth:`finish` without looking at it now; whether it says anything."""
-        if not self._layer.fixed:
-            place = (pose.x, pose.y, math.cos(pose.theta), math.sin(pose.theta))
-            limits = (scan.range_min, scan.range_max)
-            self._layer.cover(*end_extent(scan.ranges, scan.directions, place, limits, 1 / self.resolution))
-            check_size(self._layer.frame)
+    def accumulate(self, scan: Scan, pose: Pose2D) -> bool:
+        """Add one scan without updating the streaming map.
+
+        Args:
+            scan: The scan.
+            pose: Pose of the laser in the map frame.
+
+        Returns:
+            Whether it holds any measurement.
+        """
+        if not self._cells.fixed:
+            self._cells.cover(*hit_extent(scan_arrays(scan, pose), 1 / self.resolution))
+            check_size(self._cells.frame, self.options)
         return self._rays.add(scan, pose) > 0
 
     def grid(self) -> OccupancyGrid:
-        """The map so far, from the coarser one that is kept while scans come in."""
+        """Return the map so far: the streaming map, at this mapper's resolution."""
         frame = self._frame()
-        if self._stream is None:
+        if self._streaming is None:
             unknown = np.full(frame.shape, UNKNOWN, np.float32)
             return OccupancyGrid(frame, unknown, np.zeros_like(unknown))
-        coarse = self._stream.fit(self._noise).grid()
-        cells = cells_within(coarse.frame, frame)
+        coarse = self._streaming.fit(self._noise).grid(self.options.calibration)
+        cells = coarse_cell_index(coarse.frame, frame)
         ratio = coarse.frame.resolution / frame.resolution
         assert coarse.evidence is not None
         return OccupancyGrid(frame, coarse.probability[cells], coarse.evidence[cells] / np.float32(ratio))
 
-    def so_far(self) -> tuple[Level, Noise] | None:
-        """The coarser map that is kept while scans come in, and the noise; None before there is any."""
-        return None if self._stream is None else (self._stream.level, self._noise)
+    def streaming_map(self) -> tuple[Level, RangeNoise] | None:
+        """Return the streaming map and the range noise so far; None before there is any."""
+        return None if self._streaming is None else (self._streaming.level, self._noise)
 
     def finish(self) -> OccupancyGrid:
-        """The map of all scans, fitted until nothing changes much."""
-        return self.fit().grid()
+        """Return the map of all scans, fitted until convergence."""
+        return self.fit().grid(self.options.calibration)
 
-    def fit(self) -> Fit:
-        """The fit itself, before it is turned into occupancy."""
-        with workers(self._threads) as pool:
+    def fit(self) -> ForwardFit:
+        """Return the fit to all scans, before it is turned into occupancy."""
+        with worker_pool(self._threads) as pool:
             level, self._noise = self._fit(pool, self._frame())
-            return self._read(level, self._noise)
+            sums, _ = level.expect(self._rays, self._noise, with_certainty=True)
+            return fit_of(level, sums, self._noise)
 
-    def settle(self) -> None:
-        """Fits the coarser map that is kept while scans come in to all of them so far, as :meth:`finish` would."""
-        finest, coarse = self._layer.frame, self._stream_frame()
-        with workers(self._threads) as pool:
+    def refit_streaming_map(self) -> None:
+        """Fit the streaming map to all scans so far until convergence, as :meth:`finish` would."""
+        finest, coarse = self._cells.frame, self._streaming_frame()
+        with worker_pool(self._threads) as pool:
             level, self._noise = self._fit(pool, finest, round(coarse.resolution / finest.resolution))
-        self._stream = Stream(coarse, None)
-        self._stream.begin_from(level, self._rays, self._noise)
+        self._streaming = StreamingMap(coarse, None, self.options)
+        self._streaming.initialize_from(level, self._rays, self._noise)
 
     def _frame(self) -> GridFrame:
-        return self._layer.used or self._layer.frame
+        return self._cells.used or self._cells.frame
 
-    def _stream_frame(self) -> GridFrame:
-        frame, factor = self._layer.frame, 2
-        while frame.rows * frame.cols > self._stream_cells * factor**2:
+    def _streaming_frame(self) -> GridFrame:
+        frame, factor = self._cells.frame, 2
+        while frame.rows * frame.cols > self.options.streaming_cells * factor**2:
             factor *= 2
-        return coarser(frame, factor)
+        return coarsened(frame, factor)
 
-    def _first_noise(self, resolution: float) -> Noise:
-        """The noise to begin with: as given (no less than the cells show), else what neighbouring beams say."""
-        if self._fixed is not None:
-            return Noise(max(self._fixed, LEAST_GIVEN * resolution))
-        guess = max(neighbour_noise(self._rays.rays[:, 2]) or 0.0, self.resolution)
-        return Noise(min(max(self._start or guess, guess), MOST_START * guess))
+    def _initial_noise(self, resolution: float) -> RangeNoise:
+        """Return the noise to start from: as given (but bounded by the cells), else from neighbouring beams."""
+        options = self.options
+        if self._fixed_std is not None:
+            std = max(self._fixed_std, options.min_given_noise_cells * resolution)
+            return RangeNoise(std, options.min_outlier_share)
+        guess = max(neighbour_noise(self._rays.ranges) or 0.0, self.resolution)
+        std = min(max(self._start_std or guess, guess), options.max_start_ratio * guess)
+        return RangeNoise(std, options.min_outlier_share)
 
-    def _fit(self, pool: ThreadPoolExecutor | None, frame: GridFrame, last: int = 1) -> tuple[Level, Noise]:
-        """From coarse to fine, down to cells ``last`` times the frame's; then the noise from rays held out, and the
-        map from all of them.
-        """
+    def _fit(self, pool: ThreadPoolExecutor | None, frame: GridFrame, last: int = 1) -> tuple[Level, RangeNoise]:
+        """Fit from coarse to fine, down to cells ``last`` times the frame's; then noise and map, see the module."""
+        options = self.options
         self.history.clear()
-        self._learned = False
-        learns, many = self._fixed is None, len(self._rays) > THIN_RAYS
-        holds_out = learns and len(self._rays) >= HELD_OUT_RAYS
-        noise = self._first_noise(self.resolution)
-        guess = neighbour_noise(self._rays.rays[:, 2]) or 0.0
+        self._is_estimated = False
+        estimates_noise, is_thinned = self._fixed_std is None, len(self._rays) > options.thinning_rays
+        holds_out = estimates_noise and len(self._rays) >= options.hold_out_min_rays
+        fold = Fold.FITTED if holds_out else Fold.ALL
+        noise = self._initial_noise(self.resolution)
+        guess = neighbour_noise(self._rays.ranges) or 0.0
         level: Level | None = None
-        spread = noise.std / self.resolution
-        for factor in [factor for factor in factors(spread) if factor >= last] or [last]:
-            finer = Level(coarser(frame, factor), START * factor, pool)
-            noise = noise if learns else self._first_noise(finer.frame.resolution)
+        factors = level_factors(noise.std / self.resolution, options)
+        for factor in [factor for factor in factors if factor >= last] or [last]:
+            finer = Level(coarsened(frame, factor), options.initial_stopping * factor, pool, options)
+            noise = noise if estimates_noise else self._initial_noise(finer.frame.resolution)
             finer.smooth(noise.std)
             if level is not None:
-                finer.start_from(level)
-                finer.keep_free(self._rays)
-            stride = (THIN_STRIDE if level is None else HALF_STRIDE) if many else 1
-            noise = self._climb(finer, factor, Choice(stride=stride, held_out=1 if holds_out else 0), noise, learns)
+                finer.initialize_from(level)
+                finer.fix_free_cells(self._rays)
+            stride = (options.coarsest_stride if level is None else options.stride) if is_thinned else 1
+            noise = self._converge(finer, factor, RaySubset(stride=stride, fold=fold), noise, estimates_noise)
             level = finer
         assert level is not None
         if holds_out:
             noise = self._held_out_noise(level, noise)
-        elif learns:
-            noise = Noise(max(noise.std, guess), noise.wild)
-        if learns or many:
-            noise = self._climb(level, 1, ALL, noise, False, LAST_PASSES)
-        level.free_all()
+        elif estimates_noise:
+            noise = RangeNoise(max(noise.std, guess), noise.outlier_share)
+        if estimates_noise or is_thinned:
+            noise = self._converge(level, 1, ALL_RAYS, noise, False, options.final_passes)
+        level.release_free_cells()
         return level, noise
 
-    def _climb(
-        self, level: Level, factor: int, choice: Choice, noise: Noise, learns: bool, most: int | None = None
-    ) -> Noise:
-        """Passes over one level until it has converged; a step that overshot is taken back, and made plain."""
-        power, best = POWER, -math.inf
-        kept: tuple[NDArray[np.float32], NDArray[np.float32], Totals, Noise] | None = None
-        passes = most or PASSES[factor]
+    def _converge(
+        self,
+        level: Level,
+        factor: int,
+        subset: RaySubset,
+        noise: RangeNoise,
+        estimates_noise: bool,
+        max_passes: int | None = None,
+    ) -> RangeNoise:
+        """Iterate on one level until convergence; return the noise.
+
+        Steps are over-relaxed. One that lowered the likelihood is undone, and plain steps follow; the last one is
+        plain.
+        """
+        options = self.options
+        power, best = options.over_relaxation, -math.inf
+        previous: tuple[NDArray[np.float32], NDArray[np.float32], SufficientStatistics, RangeNoise] | None = None
+        passes = max_passes or options.max_passes[min(factor.bit_length(), len(options.max_passes)) - 1]
+        tolerance = options.tolerance if factor == 1 else options.coarse_tolerance
         for count in range(1, passes + 1):
-            sums, totals = level.expect(self._rays, noise, choice)
-            if kept is not None and totals.per_ray < best and power > 1:
-                parameters, sums, totals, noise = kept
-                level.restore(parameters)
+            sums, statistics = level.expect(self._rays, noise, subset)
+            if previous is not None and statistics.mean_log_likelihood < best and power > 1:
+                parameters, sums, statistics, noise = previous
+                level.set_parameters(parameters)
                 power = 1
-            elif totals.per_ray - best < (TOLERANCE if factor == 1 else COARSE_TOLERANCE):
+            elif statistics.mean_log_likelihood - best < tolerance:
                 break
             else:
-                self.history.append((factor, totals))
-            best = totals.per_ray
-            kept = level.parameters.copy(), sums, totals, noise
+                self.history.append((factor, statistics))
+            best = statistics.mean_log_likelihood
+            previous = level.parameters.copy(), sums, statistics, noise
             level.maximize(sums, power if count < passes else 1)
-            if learns:
-                noise = totals.noise(noise, level.frame.resolution)
-                self._learned = totals.tell_noise
+            if estimates_noise:
+                noise = statistics.range_noise(noise, level.frame.resolution, options)
+                self._is_estimated = statistics.determines_noise(options)
         return noise
 
-    def _held_out_noise(self, level: Level, noise: Noise) -> Noise:
-        """The noise that makes the rays most likely which the map has not seen."""
-        for _ in range(HELD_OUT_PASSES):
-            _, totals = level.expect(self._rays, noise, Choice(held_out=-1))
-            noise = totals.noise(noise, level.frame.resolution)
+    def _held_out_noise(self, level: Level, noise: RangeNoise) -> RangeNoise:
+        """Return the maximum-likelihood noise of the held-out rays, given the map."""
+        for _ in range(self.options.hold_out_passes):
+            _, statistics = level.expect(self._rays, noise, RaySubset(fold=Fold.HELD_OUT))
+            noise = statistics.range_noise(noise, level.frame.resolution, self.options)
         return noise
 
-    def _read(self, level: Level, noise: Noise) -> Fit:
-        """What all rays say about a level's map."""
-        sums, _ = level.expect(self._rays, noise, certain=True)
-        return read(level, sums, noise)
 
+def fit_of(level: Level, sums: NDArray[np.float32], noise: RangeNoise) -> ForwardFit:
+    """Return a level's map with the evidence and certainty of an E step.
 
-def read(level: Level, sums: NDArray[np.float32], noise: Noise) -> Fit:
-    """A level's map with what an E step says about it."""
-    evidence, certainty = evidence_of(sums)
+    Args:
+        level: The level.
+        sums: The E step's sums (blocks, rows * cols, 3).
+        noise: The range noise.
+
+    Returns:
+        The fit.
+    """
+    evidence, certainty = evidence_and_certainty(sums)
     shape = level.frame.shape
-    return Fit(level.frame, level.stopping, evidence.reshape(shape), certainty.reshape(shape), noise)
+    return ForwardFit(level.frame, level.stopping, evidence.reshape(shape), certainty.reshape(shape), noise)
 
 
-class Stream:
-    """The coarser map that is kept while scans come in: each is looked at together with some older rays."""
+class StreamingMap:
+    """The coarser map while scans stream in, updated by stepwise expectation-maximisation (Cappé and Moulines 2009).
 
-    def __init__(self, frame: GridFrame, before: Stream | None) -> None:
-        self.level = Level(frame, START * 2)
+    Each step takes the newest rays and some earlier ones. The E step's sums always stand for all rays so far: the new
+    rays' are added, and the earlier rays' are discounted by the share of them that is revisited.
+
+    Attributes:
+        level: The map.
+        determines_noise: Whether the last step's rays sufficed to estimate the range noise.
+    """
+
+    def __init__(self, frame: GridFrame, previous: StreamingMap | None, options: ForwardOptions = DEFAULTS) -> None:
+        """Start a map.
+
+        Args:
+            frame: Where its cells lie.
+            previous: The map on a smaller frame that it continues where both have the same resolution; else it starts
+                anew.
+            options: The mapper's options.
+        """
+        self.level = Level(frame, options.initial_stopping * 2, None, options)
         self.level.blocks = 1
+        self.determines_noise = False
+        self._options = options
         self._sums = np.zeros((1, self.level.parameters.size, COLUMNS), np.float32)
         self._done = self._next = 0
-        self.learned = False
-        if before is not None and before.level.frame.resolution == frame.resolution:  # else it begins anew
-            self.level.adopt(before.level)
-            self._done, self._next = before._done, before._next
-            self._place(before)
+        if previous is not None and previous.level.frame.resolution == frame.resolution:
+            self.level.copy_from(previous.level)
+            self._done, self._next = previous._done, previous._next
+            self._copy_sums(previous)
 
-    def _place(self, before: Stream) -> None:
-        """Takes over the sums of a smaller map."""
-        window = self.level.frame.window(before.level.frame)
+    def _copy_sums(self, smaller: StreamingMap) -> None:
+        window = self.level.frame.window(smaller.level.frame)
         rows, cols = self.level.frame.shape
-        self._sums.reshape(rows, cols, COLUMNS)[window] = before._sums.reshape(*before.level.frame.shape, COLUMNS)
+        self._sums.reshape(rows, cols, COLUMNS)[window] = smaller._sums.reshape(*smaller.level.frame.shape, COLUMNS)
 
-    def fit(self, noise: Noise) -> Fit:
-        """The map so far, at this level's resolution."""
-        return read(self.level, self._sums, noise)
+    def fit(self, noise: RangeNoise) -> ForwardFit:
+        """Return the map so far as a fit, at this map's resolution."""
+        return fit_of(self.level, self._sums, noise)
 
-    def begin_from(self, fitted: Level, rays: Rays, noise: Noise) -> None:
-        """Takes over a fitted map with the same cells, and what all rays say of it."""
-        self.level.smooth(noise.std)
-        self.level.restore(np.maximum(fitted.parameters, np.float32(NEGLIGIBLE)))  # what is 0 would stay 0
-        self._sums, totals = self.level.expect(rays, noise, certain=True)
-        self._done, self._next = len(rays), 0
-        self.learned = totals.tell_noise
+    def initialize_from(self, fitted: Level, rays: RayStore, noise: RangeNoise) -> None:
+        """Start from a fitted map.
 
-    def take(self, rays: Rays, noise: Noise, fixed: bool) -> Noise:
-        """Looks at the newest rays and at some old ones, makes one M step, and returns the noise so far.
-
-        Stepwise expectation-maximisation: the sums always stand for all rays, the newest look at each counting in
-        full and earlier looks fading.
+        Args:
+            fitted: A level with the same cells.
+            rays: All rays that it was fitted to.
+            noise: The range noise.
         """
-        new = Choice(begin=self._done, end=len(rays))
-        old = Choice(begin=self._next, end=min(self._next + REVISITED, self._done))
         self.level.smooth(noise.std)
-        revisited = (old.end or 0) - old.begin
+        negligible = np.float32(self._options.negligible_stopping)
+        self.level.set_parameters(np.maximum(fitted.parameters, negligible))  # a parameter of 0 would stay 0
+        self._sums, statistics = self.level.expect(rays, noise, with_certainty=True)
+        self._done, self._next = len(rays), 0
+        self.determines_noise = statistics.determines_noise(self._options)
+
+    def step(self, rays: RayStore, noise: RangeNoise, is_noise_fixed: bool) -> RangeNoise:
+        """Take the newest rays and some earlier ones, and compute one M step.
+
+        Args:
+            rays: All rays so far.
+            noise: The range noise.
+            is_noise_fixed: Whether the noise is given.
+
+        Returns:
+            The noise so far.
+        """
+        options, level = self._options, self.level
+        new = RaySubset(begin=self._done, end=len(rays))
+        end = min(self._next + options.revisited_rays, self._done)
+        old = RaySubset(begin=self._next, end=end)
+        level.smooth(noise.std)
         if self._done:
-            self._sums *= np.float32(1 - revisited / self._done)
+            self._sums *= np.float32(1 - (end - old.begin) / self._done)
         found = []
-        for choice in (old, new):
-            if choice.end is not None and choice.end > choice.begin:
-                sums, totals = self.level.expect(rays, noise, choice, certain=True)
+        for subset in (old, new):
+            if subset.end is not None and subset.end > subset.begin:
+                sums, statistics = level.expect(rays, noise, subset, with_certainty=True)
                 self._sums += sums
-                found.append(totals)
-        self.level.maximize(self._sums)
-        self._next = old.end if old.end is not None and old.end < self._done else 0
+                found.append(statistics)
+        level.maximize(self._sums)
+        self._next = end if end < self._done else 0
         self._done = len(rays)
-        if fixed or not found:
+        if is_noise_fixed or not found:
             return noise
-        self.learned = any(totals.tell_noise for totals in found)
-        both = Totals(*(sum(values) for values in zip(*(_values(totals) for totals in found), strict=True)))
-        return _between(noise, both.noise(noise, self.level.frame.resolution))
+        self.determines_noise = any(statistics.determines_noise(options) for statistics in found)
+        estimate = _sum_of(found).range_noise(noise, level.frame.resolution, options)
+        return _geometric_mean(noise, estimate)
 
 
-def _values(totals: Totals) -> tuple[float, int, float, float, float]:
-    return totals.log_likelihood, totals.rays, totals.stops, totals.squares, totals.wild
+def _sum_of(statistics: list[SufficientStatistics]) -> SufficientStatistics:
+    rows = [(s.log_likelihood, s.rays, s.stops, s.squares, s.outliers) for s in statistics]
+    return SufficientStatistics(*(sum(values) for values in zip(*rows, strict=True)))
 
 
-def _between(old: Noise, new: Noise) -> Noise:
-    """The geometric mean of two steps' noise, so that one odd scan does not throw it."""
-    return Noise(math.sqrt(old.std * new.std), math.sqrt(old.wild * new.wild))
+def _geometric_mean(old: RangeNoise, new: RangeNoise) -> RangeNoise:
+    """Return the geometric mean of two steps' noise, so that a single scan does not dominate it."""
+    return RangeNoise(math.sqrt(old.std * new.std), math.sqrt(old.outlier_share * new.outlier_share))
 
 
-def find_noise(scans: Iterable[tuple[Scan, Pose2D]], frame: GridFrame) -> float | None:
-    """The sensor's noise (m), found from scans and the poses of their laser on a map of ``frame``; None if it cannot.
+def estimate_noise(
+    scans: Iterable[tuple[Scan, Pose2D]], frame: GridFrame, options: ForwardOptions = DEFAULTS
+) -> float | None:
+    """Estimate the range noise alone; large maps are made of larger cells.
 
-    A map of more than NOISE_CELLS is made of larger cells.
+    Args:
+        scans: Scans with the pose of their laser in the map frame.
+        frame: The map's frame.
+        options: The mapper's options.
+
+    Returns:
+        The standard deviation (m); None where too few rays stopped in the map.
     """
     factor = 1
-    while frame.rows * frame.cols > NOISE_CELLS * factor**2:
+    while frame.rows * frame.cols > options.noise_cells * factor**2:
         factor *= 2
-    frame = coarser(frame, factor)
-    mapper = ForwardMapper(frame.resolution, frame.bounds)
+    frame = coarsened(frame, factor)
+    mapper = ForwardMapper(frame.resolution, frame.bounds, options=options)
     for scan, pose in scans:
-        mapper.keep(scan, pose)
+        mapper.accumulate(scan, pose)
     mapper.fit()
     return mapper.noise_std
 
 
-def check_size(frame: GridFrame) -> None:
-    """Raises UsageError for a map that would not fit the memory: the fit takes some 80 bytes for each cell."""
-    if frame.rows * frame.cols > MOST_CELLS:
+def check_size(frame: GridFrame, options: ForwardOptions = DEFAULTS) -> None:
+    """Check that a map fits into memory: the fit takes some 80 bytes per cell.
+
+    Args:
+        frame: The map's frame.
+        options: The mapper's options.
+
+    Raises:
+        UsageError: Where it does not.
+    """
+    if frame.rows * frame.cols > options.max_cells:
         raise UsageError(
             f"a map of {frame.rows * frame.cols / 1e6:.0f} million cells is too large for --mapper forward "
-            f"(at most {MOST_CELLS / 1e6:.0f} million): give a coarser --resolution or smaller --bounds"
+            f"(at most {options.max_cells / 1e6:.0f} million): give a coarser --resolution or smaller --bounds"
         )
 
 
 def cores() -> int:
-    """How many cores this process may use."""
+    """Return the number of cores that this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 @contextmanager
-def workers(threads: int) -> Iterator[ThreadPoolExecutor | None]:
-    """A pool of threads for the time being; none where one is enough."""
+def worker_pool(threads: int) -> Iterator[ThreadPoolExecutor | None]:
+    """Yield a pool of threads for the time of a context; None where one thread is enough."""
     if threads == 1:
         yield None
         return
@@ -424,25 +485,48 @@ def workers(threads: int) -> Iterator[ThreadPoolExecutor | None]:
         yield pool
 
 
-def coarser(frame: GridFrame, factor: int) -> GridFrame:
-    """The frame of cells larger by ``factor``, on whole multiples of their size, that covers another."""
+def coarsened(frame: GridFrame, factor: int) -> GridFrame:
+    """Return the frame of larger cells, on whole multiples of their size, that covers another.
+
+    Args:
+        frame: The frame.
+        factor: How many times as large the cells are.
+
+    Returns:
+        The coarser frame.
+    """
     row, col = frame.row // factor, frame.col // factor
     rows = -(-(frame.row + frame.rows) // factor) - row
     cols = -(-(frame.col + frame.cols) // factor) - col
     return GridFrame(frame.resolution * factor, row, col, rows, cols)
 
 
-def factors(spread: float) -> list[int]:
-    """The levels' factors for noise of ``spread`` cells, coarse to fine."""
-    factor = 4
-    while factor < COARSEST and 4 * factor < spread:
+def level_factors(noise_cells: float, options: ForwardOptions = DEFAULTS) -> list[int]:
+    """Return how many times as large as the map's the levels' cells are, coarse to fine.
+
+    Args:
+        noise_cells: Standard deviation of the range noise (cells).
+        options: The mapper's options.
+
+    Returns:
+        Powers of 2, the last one 1.
+    """
+    factor = options.min_coarsest_factor
+    while factor < options.max_coarsest_factor and options.coarsest_noise_cells * factor < noise_cells:
         factor *= 2
     return [factor >> k for k in range(factor.bit_length())]
 
 
 def neighbour_noise(ranges: NDArray[np.float32]) -> float | None:
-    """A guess at the noise (m) from the differences of neighbouring beams; None where there are no two."""
-    apart = np.diff(ranges[np.isfinite(ranges)])
-    if not len(apart):
+    """Estimate the range noise from the differences of neighbouring beams, by their median absolute deviation.
+
+    Args:
+        ranges: Ranges (N,) in m, in the order of their beams; those that are not finite are left out.
+
+    Returns:
+        The standard deviation (m), an upper bound where ranges vary; None where there are no two beams.
+    """
+    differences = np.diff(ranges[np.isfinite(ranges)])
+    if not len(differences):
         return None
-    return float(np.median(np.abs(apart))) * 1.4826 / math.sqrt(2)
+    return float(np.median(np.abs(differences))) * 1.4826 / math.sqrt(2)

@@ -1,4 +1,9 @@
-"""How well a scan fits a map from a pose, and where it would fit better: the forward sensor model as a likelihood."""
+"""The forward sensor model as a likelihood of poses: how well a scan fits a map, and the pose where it fits best.
+
+log p(scan | pose, map) is the sum of the rays' log-densities under the model of :mod:`mapping.forward.likelihood`.
+Its score (gradient) is found by central differences, its information by the outer product of single rays' scores
+(Berndt, Hall, Hall and Hausman 1974), and its maximum by Gauss-Newton steps.
+"""
 
 from __future__ import annotations
 
@@ -8,165 +13,247 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from mapping.forward.level import FARTHEST, Level, Noise
-from mapping.forward.likelihood import look, tables
-from mapping.forward.mapper import Fit
+from mapping.forward.level import Level, RangeNoise, geometry_fields, sensor_fields
+from mapping.forward.likelihood import RayModel, pose_likelihood
+from mapping.forward.mapper import ForwardFit
+from mapping.forward.options import DEFAULTS
 from mapping.grid import GridFrame
 from prim.arrays import FloatArray
 from prim.scan import Scan
-from prim.se2 import Pose2D
+from prim.se2 import Pose2D, rotate
 
-NUDGE_CELLS, NUDGE_SPREAD = 0.5, 0.2
-"""Derivatives are taken by differences over this many cells, or over this share of the noise where that is larger."""
 
-LEAST_CELLS = 0.5
-"""The noise counts as this many cells at least: a cell does not say where in it a surface stands."""
+@dataclass(frozen=True, slots=True)
+class ScanLikelihoodOptions:
+    """Options of the likelihood of poses and of its maximisation; all set by hand."""
 
-NUDGE_REACH = 1.0
-"""A turn moves what is this far off (m) as far as the differences of place do."""
+    difference_cells: float = 0.5
+    """Half-width (cells) of the central differences, or ``difference_noise`` times the noise where that is larger."""
 
-STEPS = 4
-"""Gauss-Newton steps to a better pose at most."""
+    difference_noise: float = 0.2
+    """Half-width of the central differences as a share of the noise's standard deviation."""
 
-LONGEST = 8
-"""A step is made so many times as long at most, where it goes on uphill."""
+    lever_arm: float = 1.0
+    """The difference of heading displaces what is this far away (m) as far as the differences of position do."""
 
-STILL_METRES, STILL_RADIANS = 2e-4, 1e-4
-"""A step that is shorter is none."""
+    min_noise_cells: float = 0.5
+    """The noise counts as this many cells at least: where in a cell a surface lies is unknown."""
 
-_TABLE = tables()
+    max_steps: int = 4
+    """Largest number of Gauss-Newton steps."""
+
+    max_extension: int = 8
+    """A step is lengthened up to this many times, while the posterior rises."""
+
+    min_translation: float = 2e-4
+    """A step that moves by less than this (m) and turns by less than ``min_rotation`` counts as none."""
+
+    min_rotation: float = 1e-4
+    """See ``min_translation`` (rad)."""
+
+
+POSE_DEFAULTS = ScanLikelihoodOptions()
 
 
 @dataclass(frozen=True)
-class Beams:
+class ScanRays:
     """A scan's measurements in the frame of its laser.
 
-    ``rays`` (N, 5) are as :func:`mapping.forward.likelihood.look` takes them, ``limits`` range_min and range_max (m).
+    Attributes:
+        rays: (N, 5): where each beam starts (x, y), its direction, its range (m; -inf: nearer than range_min, inf: no
+            return).
+        limits: range_min and range_max (m).
     """
 
     rays: FloatArray
     limits: tuple[float, float]
 
     @classmethod
-    def of(cls, pieces: Sequence[tuple[Scan, Pose2D]], pose: Pose2D, most: int, offset: int = 0) -> Beams:
-        """At most ``most`` measurements of a scan, evenly spread from the ``offset``-th on, as seen from ``pose``.
+    def from_pieces(
+        cls, pieces: Sequence[tuple[Scan, Pose2D]], pose: Pose2D, max_rays: int, offset: int = 0
+    ) -> ScanRays:
+        """Collect a scan's measurements, see :meth:`prim.scan.Scan.censored_ranges`.
 
-        ``pieces`` are parts of the scan with the pose that each was taken from. What counts as a measurement is as in
-        :meth:`mapping.forward.level.Rays.add`.
+        Args:
+            pieces: The scan in pieces, with the laser's pose at each.
+            pose: The laser's pose that the rays are given in.
+            max_rays: Largest number of rays; they are evenly spaced.
+            offset: Index of the first one, modulo the spacing.
+
+        Returns:
+            The rays.
         """
         first = pieces[0][0]
-        back = pose.inverse()
+        inverse = pose.inverse()
         parts = []
-        for scan, taken_from in pieces:
-            seen_from = back @ Pose2D(taken_from.x, taken_from.y, taken_from.theta)
-            z = scan.ranges
-            with np.errstate(invalid="ignore"):
-                used = ((z >= scan.range_min) & (z > 0)) | (np.isneginf(z) & (scan.range_min > 0))
+        for scan, piece_pose in pieces:
+            relative = inverse @ Pose2D(piece_pose.x, piece_pose.y, piece_pose.theta)
+            used, ranges = scan.censored_ranges()
             rays = np.empty((int(np.count_nonzero(used)), 5))
-            rays[:, :2] = seen_from.x, seen_from.y
-            rays[:, 2:4] = Pose2D(0, 0, seen_from.theta).apply(scan.directions[used])
-            rays[:, 4] = np.where(z[used] >= scan.range_max, np.inf, z[used])
+            rays[:, :2] = relative.x, relative.y
+            rays[:, 2:4] = rotate(scan.directions[used], relative.theta)
+            rays[:, 4] = ranges
             parts.append(rays)
         every = np.concatenate(parts)
-        stride = max(1, -(-len(every) // most))
-        limits = max(first.range_min, 0.0), min(first.range_max, FARTHEST)
+        stride = max(1, -(-len(every) // max_rays))
+        limits = float(max(first.range_min, 0.0)), float(min(first.range_max, DEFAULTS.max_range))
         return cls(np.ascontiguousarray(every[offset % stride :: stride]), limits)
 
 
 @dataclass(frozen=True)
-class Look:
-    """A scan's log-likelihood from a pose, its slope (3,) and the information (3, 3) that it holds about the pose."""
+class PoseScore:
+    """The likelihood of a pose and its derivatives.
+
+    Attributes:
+        log_likelihood: Log-likelihood of the scan (nats).
+        score: Gradient of the log-likelihood (3,) with respect to x, y (m), heading (rad).
+        information: Information about the pose (3, 3).
+        rays: Number of rays that cross the map.
+    """
 
     log_likelihood: float
-    slope: FloatArray
+    score: FloatArray
     information: FloatArray
     rays: int
 
 
 @dataclass(frozen=True)
-class Likelihood:
-    """A map of stopping chances that scans can be held against."""
+class ScanLikelihood:
+    """The likelihood of scans under a map of stopping probabilities.
+
+    Attributes:
+        frame: Where the map's cells lie.
+        stopping: Stopping probabilities (rows, cols) float32.
+        noise: The range noise.
+        ray_model: The sensor model's parameters that are not estimated.
+        options: The likelihood's options.
+    """
 
     frame: GridFrame
     stopping: NDArray[np.float32]
-    noise: Noise
+    noise: RangeNoise
+    ray_model: RayModel = DEFAULTS.ray_model
+    options: ScanLikelihoodOptions = POSE_DEFAULTS
 
     @classmethod
-    def of(cls, level: Level | Fit, noise: Noise) -> Likelihood:
-        """The likelihood under a level's map, or a fit's."""
-        std = max(noise.std, LEAST_CELLS * level.frame.resolution)
-        return cls(level.frame, level.stopping, Noise(std, noise.wild))
+    def of(
+        cls, level: Level | ForwardFit, noise: RangeNoise, options: ScanLikelihoodOptions = POSE_DEFAULTS
+    ) -> ScanLikelihood:
+        """Return the likelihood under a level's or a fit's map.
 
-    def look(self, beams: Beams, pose: FloatArray, mount: FloatArray, widened: float = 1.0) -> Look:
-        """A scan from a robot at ``pose`` (3,) whose laser is mounted at ``mount`` (3,); noise ``widened`` times."""
-        std = self.noise.std * widened
-        step = max(NUDGE_CELLS * self.frame.resolution, NUDGE_SPREAD * std)
-        return self._look(beams, pose, mount, std, np.array([step, step, step / NUDGE_REACH]))
+        Args:
+            level: The map.
+            noise: The range noise; bounded by ``min_noise_cells``.
+            options: The likelihood's options.
 
-    def of_scan(self, beams: Beams, pose: FloatArray, mount: FloatArray, widened: float = 1.0) -> float:
-        """The log-likelihood alone."""
-        return self._look(beams, pose, mount, self.noise.std * widened, np.zeros(3)).log_likelihood
+        Returns:
+            The likelihood.
+        """
+        std = max(noise.std, options.min_noise_cells * level.frame.resolution)
+        return cls(level.frame, level.stopping, RangeNoise(std, noise.outlier_share), options=options)
 
-    def _look(self, beams: Beams, pose: FloatArray, mount: FloatArray, std: float, nudges: FloatArray) -> Look:
-        found = np.empty(11)
-        look(
-            beams.rays,
-            pose,
-            mount,
-            beams.limits,
-            nudges,
-            np.array(self.frame.origin),
-            self.frame.resolution,
-            self.stopping,
-            std,
-            self.noise.wild,
-            _TABLE,
-            found,
-        )
-        slope, rays = found[1:4], int(found[10])
-        information = found[[4, 5, 6, 5, 7, 8, 6, 8, 9]].reshape(3, 3) - np.outer(slope, slope) / max(rays, 1)
-        return Look(float(found[0]), slope, information, rays)
+    def score(self, scan: ScanRays, pose: FloatArray, mount: FloatArray, noise_scale: float = 1.0) -> PoseScore:
+        """Compute the log-likelihood of a pose, its score and its information.
+
+        Args:
+            scan: The scan.
+            pose: The robot's pose (3,).
+            mount: The laser's pose (3,) in the robot's frame.
+            noise_scale: The noise's standard deviation is multiplied by this.
+
+        Returns:
+            The likelihood and its derivatives.
+        """
+        std, options = self.noise.std * noise_scale, self.options
+        step = max(options.difference_cells * self.frame.resolution, options.difference_noise * std)
+        return self._evaluate(scan, pose, mount, std, np.array([step, step, step / options.lever_arm]))
+
+    def log_likelihood(self, scan: ScanRays, pose: FloatArray, mount: FloatArray, noise_scale: float = 1.0) -> float:
+        """Compute the log-likelihood of a pose alone.
+
+        Args:
+            scan: The scan.
+            pose: The robot's pose (3,).
+            mount: The laser's pose (3,) in the robot's frame.
+            noise_scale: The noise's standard deviation is multiplied by this.
+
+        Returns:
+            The log-likelihood (nats).
+        """
+        return self._evaluate(scan, pose, mount, self.noise.std * noise_scale, np.zeros(3)).log_likelihood
+
+    def _evaluate(
+        self, scan: ScanRays, pose: FloatArray, mount: FloatArray, std: float, steps: FloatArray
+    ) -> PoseScore:
+        result = np.empty(11)
+        sensor = sensor_fields(RangeNoise(std, self.noise.outlier_share), self.ray_model)
+        geometry, placement = geometry_fields(self.frame), (pose, mount, steps)
+        pose_likelihood(scan.rays, scan.limits, placement, geometry, self.stopping, sensor, result)
+        score, rays = result[1:4], int(result[10])
+        information = result[[4, 5, 6, 5, 7, 8, 6, 8, 9]].reshape(3, 3) - np.outer(score, score) / max(rays, 1)
+        return PoseScore(float(result[0]), score, information, rays)
 
 
-def climb(
-    likelihood: Likelihood,
-    beams: Beams,
+def maximize_pose(
+    likelihood: ScanLikelihood,
+    scan: ScanRays,
     mount: FloatArray,
     pose: FloatArray,
     prior: FloatArray,
-    believed: FloatArray,
-    widened: float = 1.0,
-) -> tuple[FloatArray, Look]:
-    """A likelier pose (3,) by a few Gauss-Newton steps from ``pose`` on, and what the scan says there.
+    prior_information: FloatArray,
+    noise_scale: float = 1.0,
+) -> tuple[FloatArray, PoseScore]:
+    """Maximise the posterior of a pose by a few Gauss-Newton steps.
 
-    ``prior`` is what is believed beforehand, with information ``believed`` (3, 3). Far off, single rays' slopes
-    promise more information than there is: a step that goes on uphill is made longer, one that overshoots shorter.
+    Far from the maximum the outer product of scores overestimates the information: a step is lengthened while the
+    posterior rises, and halved until it does.
+
+    Args:
+        likelihood: The likelihood under a map.
+        scan: The scan.
+        mount: The laser's pose (3,) in the robot's frame.
+        pose: The robot's pose (3,) to start from.
+        prior: Mean of the pose's Gaussian prior (3,).
+        prior_information: Information of the prior (3, 3).
+        noise_scale: The noise's standard deviation is multiplied by this.
+
+    Returns:
+        The pose (3,), and the likelihood there.
     """
+    options = likelihood.options
 
-    def worth(at: FloatArray, log_likelihood: float) -> float:
-        return float(log_likelihood - (at - prior) @ believed @ (at - prior) / 2)
+    def log_posterior(at: FloatArray, log_likelihood: float) -> float:
+        return float(log_likelihood - (at - prior) @ prior_information @ (at - prior) / 2)
 
-    def along(step: FloatArray) -> float:
-        return worth(pose + step, likelihood.of_scan(beams, pose + step, mount, widened))
+    def after(step: FloatArray) -> float:
+        return log_posterior(pose + step, likelihood.log_likelihood(scan, pose + step, mount, noise_scale))
 
-    look = likelihood.look(beams, pose, mount, widened)
-    for _ in range(STEPS):
-        height = worth(pose, look.log_likelihood)
-        slope = look.slope - believed @ (pose - prior)
-        step: FloatArray = np.linalg.solve(look.information + believed, slope).astype(float)
-        reached, length = along(step), 1
-        while reached > height and length < LONGEST and (further := along(2 * step)) > reached:
+    current = likelihood.score(scan, pose, mount, noise_scale)
+    for _ in range(options.max_steps):
+        height = log_posterior(pose, current.log_likelihood)
+        gradient = current.score - prior_information @ (pose - prior)
+        step: FloatArray = np.linalg.solve(current.information + prior_information, gradient).astype(float)
+        reached, length = after(step), 1
+        while reached > height and length < options.max_extension and (further := after(2 * step)) > reached:
             step, reached, length = 2 * step, further, 2 * length
-        while reached <= height and not is_still(step):
+        while reached <= height and not is_negligible(step, options):
             step = step / 2
-            reached = along(step)
-        if reached <= height or is_still(step):
+            reached = after(step)
+        if reached <= height or is_negligible(step, options):
             break
         pose = pose + step
-        look = likelihood.look(beams, pose, mount, widened)
-    return pose, look
+        current = likelihood.score(scan, pose, mount, noise_scale)
+    return pose, current
 
 
-def is_still(step: FloatArray) -> bool:
-    """Whether a step (3,) is too short to count."""
-    return bool(np.abs(step[:2]).max() < STILL_METRES and abs(step[2]) < STILL_RADIANS)
+def is_negligible(step: FloatArray, options: ScanLikelihoodOptions = POSE_DEFAULTS) -> bool:
+    """Return whether a step is too short to count.
+
+    Args:
+        step: The step (3,).
+        options: The limits.
+
+    Returns:
+        Whether both its translation and its rotation are below them.
+    """
+    return bool(np.abs(step[:2]).max() < options.min_translation and abs(step[2]) < options.min_rotation)

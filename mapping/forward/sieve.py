@@ -1,11 +1,18 @@
-"""The compiled kernels that turn expected hits and passes into a smooth map of stopping chances.
+"""The sieve: the forward map's prior, and the M step under it.
 
-The chance of a cell to stop a ray is a weighted mean of its neighbours' parameters, o = K p, with Gaussian weights K
-that sum to 1 (a sieve in the sense of Grenander). A ray that enters a cell draws one of the neighbours and stops
-with that one's chance, so that the M step stays exact: the likelihood rises at every pass.
+The stopping probabilities are a smoothed field, o = K p: each o_c is the weighted mean of its neighbours' parameters
+p, with Gaussian weights K that sum to 1. Restricting the maximum-likelihood estimate to such fields is Grenander's
+method of sieves (Geman and Hwang 1982). Neighbouring cells agree because they share parameters.
 
-Compiled code is cached beside this file and made anew when this file changes, so that every constant it uses must
-stand here.
+The M step stays exact. A ray that enters cell c draws a neighbour d with probability K_cd and stops with probability
+p_d; with d as a latent variable, the expected hits h_c and passes g_c of the E step give
+
+    p_d / (1 - p_d)  <-  p_d / (1 - p_d) * [K^T (h / o)]_d / [K^T (g / (1 - o))]_d,
+
+and the likelihood does not fall. Raising the ratio to a power above 1 is over-relaxation (Salakhutdinov and Roweis
+2003).
+
+Numba's cache watches only this file: constants that the kernels use must stand here, model parameters are arguments.
 """
 
 from __future__ import annotations
@@ -17,25 +24,38 @@ from numpy.typing import NDArray
 
 from prim.compiled import inline, kernel
 
-LEAST, MOST = 1e-7, 1 - 1e-4
-"""The bounds of a cell's stopping chance."""
-
-TAPS_REACH = 2.5
-"""The Gaussian weights end at this many standard deviations."""
+NO_COUNTS = 1e-12
+"""A parameter with fewer expected hits and passes than this is left as it is."""
 
 
-def taps(width: float) -> NDArray[np.float32]:
-    """Gaussian weights (2 n + 1,) of standard deviation ``width`` (cells), which sum to 1; a single one below 0.3."""
-    if width < 0.3:
+def gaussian_kernel(width: float, min_width: float = 0.3, truncation: float = 2.5) -> NDArray[np.float32]:
+    """Return a one-dimensional Gaussian kernel.
+
+    Args:
+        width: Standard deviation (cells).
+        min_width: Below this width the kernel is a single weight.
+        truncation: The kernel ends at this many standard deviations.
+
+    Returns:
+        Weights (2 n + 1,) that sum to 1.
+    """
+    if width < min_width:
         return np.ones(1, np.float32)
-    reach = max(1, round(TAPS_REACH * width))
+    reach = max(1, round(truncation * width))
     weights = np.exp(-0.5 * (np.arange(-reach, reach + 1) / width) ** 2)
     return np.asarray(weights / weights.sum(), dtype=np.float32)
 
 
 @inline
-def blur_across(source: Any, target: Any, weights: Any, index: int) -> None:
-    """One row of the vertical pass: target[index] = sum of weights * source rows around it."""
+def blur_rows(source: Any, target: Any, weights: Any, index: int) -> None:
+    """Compute one row of the vertical convolution.
+
+    Args:
+        source: (rows, cols).
+        target: (rows, cols); row ``index`` is filled.
+        weights: The kernel (2 n + 1,).
+        index: The row.
+    """
     n = weights.shape[0] // 2
     rows = source.shape[0]
     for j in range(source.shape[1]):
@@ -48,26 +68,41 @@ def blur_across(source: Any, target: Any, weights: Any, index: int) -> None:
 
 
 @kernel
-def blur(source: Any, weights: Any, between: Any, target: Any) -> None:
-    """Separable convolution of ``source`` (rows, cols) into ``target``, 0 outside; ``between`` is room for work."""
+def blur(source: Any, weights: Any, scratch: Any, target: Any) -> None:
+    """Convolve an array with a kernel along both axes; what lies outside is 0.
+
+    Args:
+        source: (rows, cols).
+        weights: The kernel (2 n + 1,).
+        scratch: Working memory (rows, cols).
+        target: Filled (rows, cols).
+    """
     rows, cols = source.shape
     n = weights.shape[0] // 2
     for i in range(rows):
         for j in range(cols):
-            between[i, j] = weights[n] * source[i, j]
+            scratch[i, j] = weights[n] * source[i, j]
         for k in range(1, n + 1):
             w = weights[n + k]
             for j in range(cols - k):
-                between[i, j] += w * source[i, j + k]
+                scratch[i, j] += w * source[i, j + k]
             for j in range(k, cols):
-                between[i, j] += w * source[i, j - k]
+                scratch[i, j] += w * source[i, j - k]
     for i in range(rows):
-        blur_across(between, target, weights, i)
+        blur_rows(scratch, target, weights, i)
 
 
 @kernel
-def borders(count: int, weights: Any) -> Any:
-    """What is left of the weights' sum around each of ``count`` cells in a line."""
+def kernel_sums(count: int, weights: Any) -> Any:
+    """Compute the sum of a kernel's weights that lie within a line of cells, around each of them.
+
+    Args:
+        count: The number of cells.
+        weights: The kernel (2 n + 1,).
+
+    Returns:
+        The sums (count,): 1 but near the ends.
+    """
     n = weights.shape[0] // 2
     sums = np.zeros(count, np.float32)
     for i in range(count):
@@ -78,10 +113,16 @@ def borders(count: int, weights: Any) -> Any:
 
 
 @kernel
-def gather(sums: Any, stopping: Any, row_sums: Any, col_sums: Any, hits: Any, passes: Any) -> None:
-    """Adds up the blocks' ``sums`` (blocks, rows * cols, 2 or 3), always in the same order, and divides by the model:
+def reduce_blocks(sums: Any, stopping: Any, row_sums: Any, col_sums: Any, hits: Any, passes: Any) -> None:
+    """Add up the blocks' expected counts, always in the same order, and divide them by the model.
 
-    ``hits`` / o and ``passes`` / (1 - o), over the sums of weights.
+    Args:
+        sums: Expected hits and passes (blocks, rows * cols, 2 or 3) of the E step.
+        stopping: Stopping probabilities o (rows, cols).
+        row_sums: The kernel's sums (rows,), see :func:`kernel_sums`.
+        col_sums: The kernel's sums (cols,).
+        hits: Filled (rows, cols) with hits / o over the kernel's sums.
+        passes: Filled (rows, cols) with passes / (1 - o) over the kernel's sums.
     """
     rows, cols = stopping.shape
     for i in range(rows):
@@ -98,17 +139,23 @@ def gather(sums: Any, stopping: Any, row_sums: Any, col_sums: Any, hits: Any, pa
 
 
 @kernel
-def maximize(parameters: Any, active: Any, hits: Any, passes: Any, power: int) -> None:
-    """The M step in place, from blurred hits / o and passes / (1 - o).
+def maximize(parameters: Any, active: Any, hits: Any, passes: Any, power: int, bounds: Any) -> None:
+    """Compute the M step of the sieve's parameters, in place.
 
-    A parameter's odds are multiplied by their ratio, ``power`` times: once is expectation-maximisation, more often
-    over-relaxed. Only ``active`` ones change.
+    Args:
+        parameters: The parameters p (rows, cols).
+        active: Which of them change (rows, cols).
+        hits: K^T (hits / o) (rows, cols).
+        passes: K^T (passes / (1 - o)) (rows, cols).
+        power: How often the odds are multiplied by the ratio of the two: 1 is expectation-maximisation, more is
+            over-relaxed.
+        bounds: The parameters' lower and upper bound, float32.
     """
     rows, cols = parameters.shape
     for i in range(rows):
         for j in range(cols):
             h, p = hits[i, j], passes[i, j]
-            if active[i, j] and h + p > 1e-12:
+            if active[i, j] and h + p > NO_COUNTS:
                 value = parameters[i, j]
                 up, down = value, np.float32(1) - value
                 for _ in range(power):
@@ -117,13 +164,20 @@ def maximize(parameters: Any, active: Any, hits: Any, passes: Any, power: int) -
                     total = up + down
                     up /= total
                     down /= total
-                parameters[i, j] = min(max(up, np.float32(LEAST)), np.float32(MOST))
+                parameters[i, j] = min(max(up, bounds[0]), bounds[1])
 
 
 @kernel
-def normalise(blurred: Any, row_sums: Any, col_sums: Any) -> None:
-    """Divides by the sums of weights, in place."""
+def normalize(blurred: Any, row_sums: Any, col_sums: Any, bounds: Any) -> None:
+    """Divide a blurred array by the kernel's sums, in place, and clip it.
+
+    Args:
+        blurred: (rows, cols).
+        row_sums: The kernel's sums (rows,), see :func:`kernel_sums`.
+        col_sums: The kernel's sums (cols,).
+        bounds: Lower and upper bound, float32.
+    """
     for i in range(blurred.shape[0]):
         for j in range(blurred.shape[1]):
             value = blurred[i, j] / (row_sums[i] * col_sums[j])
-            blurred[i, j] = min(max(value, np.float32(LEAST)), np.float32(MOST))
+            blurred[i, j] = min(max(value, bounds[0]), bounds[1])

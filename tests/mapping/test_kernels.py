@@ -1,4 +1,4 @@
-"""The compiled kernels against textbook loops."""
+"""The compiled kernels against plain loops."""
 
 import math
 from fractions import Fraction
@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from mapping.deterministic import DeterministicMapper
 from mapping.grid import GridFrame, cell_of
-from mapping.kernels import FREE, OCCUPIED, UNSEEN, mark
+from mapping.kernels import FREE, OCCUPIED, UNSEEN, mark_scan
 from mapping.mapper import make_mapper
 from mapping.probabilistic import ProbabilisticMapper, inverse_sensor_model, log_odds
 from prim.scan import Scan
@@ -18,7 +18,7 @@ from prim.se2 import Pose2D
 
 
 def bresenham(row: int, col: int, end_row: int, end_col: int) -> list[tuple[int, int]]:
-    """Cells from start to end, the textbook's way: whole numbers and an error that is carried along."""
+    """Return the cells from start to end by the textbook's algorithm: integers and an error term."""
     d_row, d_col = abs(end_row - row), abs(end_col - col)
     step_row, step_col = (1 if end_row >= row else -1), (1 if end_col >= col else -1)
     steep = d_row > d_col
@@ -35,14 +35,14 @@ def bresenham(row: int, col: int, end_row: int, end_col: int) -> list[tuple[int,
 
 
 def mark_line(end_row: int, end_col: int, hit: bool, rows: int, cols: int, row: int, col: int) -> np.ndarray:
-    """One ray from the centre of cell (row, col) to that of (end_row, end_col), in cells of 1 m."""
+    """Return the states after one ray between the centres of (row, col) and (end_row, end_col); cells of 1 m."""
     states = np.full((rows, cols), UNSEEN, np.uint8)
     dx, dy = end_col - col, end_row - row
     z = math.hypot(dx, dy)
     direction = np.array([[dx / z, dy / z]]) if z else np.array([[1.0, 0.0]])
     limits = (0.0, 2 * z + 1) if hit else (0.0, z)
     ranges = np.array([max(z, 0.25)], dtype=np.float64)
-    mark(states, 0, 0, ranges, direction, (col + 0.5, row + 0.5, 1.0, 0.0), limits, 1.0)
+    mark_scan(states, (0, 0, 1.0), (ranges, direction, col + 0.5, row + 0.5, 1.0, 0.0, *limits))
     return states
 
 
@@ -50,7 +50,7 @@ CELLS = st.integers(-40, 60)
 
 
 @given(CELLS, CELLS, CELLS, CELLS, st.booleans())
-def test_lines_are_bresenhams_and_clipping_moves_no_cell(
+def test_lines_are_bresenham_lines_and_clipping_moves_no_cell(
     row: int, col: int, end_row: int, end_col: int, hit: bool
 ) -> None:
     if (row, col) == (end_row, end_col):
@@ -78,13 +78,13 @@ def test_long_lines_are_exact(end_row: int, end_col: int) -> None:
 
 @given(st.integers(1, 700_000), st.data())
 def test_fixed_point_offsets_are_exact(steps: int, data: st.DataObject) -> None:
-    """floor(k m / n + 1/2) in rational numbers against the kernel's arithmetic, up to its stated limit."""
-    from mapping.kernels import HALF, SHIFT, tilt_of
+    """Compare floor(k m / n + 1/2) in rational numbers with the kernel's arithmetic, up to its stated limit."""
+    from mapping.kernels import HALF, SHIFT, fixed_point_slope
 
     minor, step = data.draw(st.integers(0, steps)), data.draw(st.integers(0, steps))
-    tilt = tilt_of(minor, steps)
+    slope = fixed_point_slope(minor, steps)
     exact = math.floor(Fraction(step * minor, steps) + Fraction(1, 2))
-    assert (step * tilt + HALF) >> SHIFT == exact
+    assert (step * slope + HALF) >> SHIFT == exact
 
 
 def test_a_ray_never_frees_the_cell_that_it_hits_nor_one_that_another_hits() -> None:
@@ -124,7 +124,7 @@ def test_frames_cover_their_bounds_exactly() -> None:
 
 
 def slow_log_odds(scan: Scan, pose: Pose2D, frame: GridFrame) -> np.ndarray:
-    """Eqs. 3 and 4 by plain loops: Bresenham's line to the end point, walked on at its slope to 0.03 m behind."""
+    """Compute Eqs. 3 and 4 by plain loops: Bresenham's line to the end point, extended at its slope by 0.03 m."""
     odds = np.zeros(frame.shape)
     resolution = frame.resolution
     col, row = cell_of(pose.x, resolution), cell_of(pose.y, resolution)
@@ -139,13 +139,13 @@ def slow_log_odds(scan: Scan, pose: Pose2D, frame: GridFrame) -> np.ndarray:
         within = d_col == d_row == 0
         along_x = abs(dx) >= abs(dy) if within else abs(d_col) >= abs(d_row)
         steps, minor = (abs(d_col), abs(d_row)) if along_x else (abs(d_row), abs(d_col))
-        tilt = Fraction(minor, steps) if steps else Fraction(min(abs(dx), abs(dy)) / max(abs(dx), abs(dy)))
+        slope = Fraction(minor, steps) if steps else Fraction(min(abs(dx), abs(dy)) / max(abs(dx), abs(dy)))
         last = steps
         if hit:
             far = (pose.x + (z + 0.03) * dx, pose.y + (z + 0.03) * dy)
             last = abs(cell_of(far[0], resolution) - col) if along_x else abs(cell_of(far[1], resolution) - row)
         for step in range(last + 1):
-            aside = math.floor(step * tilt + Fraction(1, 2))
+            aside = math.floor(step * slope + Fraction(1, 2))
             at_col = col + (step if along_x else aside) * (1 if dx >= 0 else -1)
             at_row = row + (aside if along_x else step) * (1 if dy >= 0 else -1)
             r, c = at_row - frame.row, at_col - frame.col
@@ -163,8 +163,8 @@ def bearings_of(scan: Scan, pose: Pose2D) -> list[float]:
 @pytest.mark.parametrize("resolution", [0.01, 0.05, 0.1, 0.2])
 @settings(max_examples=25)
 @given(seed=st.integers(0, 10**6))
-def test_prob_is_what_plain_loops_give(resolution: float, seed: int) -> None:
-    """Coarse grids too, where a ray may end in the cell that it starts from."""
+def test_prob_agrees_with_plain_loops(resolution: float, seed: int) -> None:
+    """On coarse grids too, where a ray may end in the cell that it starts from."""
     rng = np.random.default_rng(seed)
     ranges = (rng.random(12) ** 3 * 1.2).astype(np.float32)
     ranges[rng.random(12) < 0.2] = np.inf
@@ -178,8 +178,8 @@ def test_prob_is_what_plain_loops_give(resolution: float, seed: int) -> None:
 
 @pytest.mark.parametrize("name", ["det", "prob"])
 @pytest.mark.parametrize("far", [1e4, 167772.16, 1e6, 1e9, 1e18, 1e300, math.inf, math.nan])
-def test_poses_far_off_the_grid_write_nowhere(name: str, far: float) -> None:
-    """Beyond 2^21 cells a scan is not used; nearer ones are clipped."""
+def test_scans_from_far_off_the_grid_change_nothing(name: str, far: float) -> None:
+    """A scan from beyond 2^21 cells is not used; nearer ones are clipped."""
     rng = np.random.default_rng(0)
     for x, y in ((far, 0.0), (-far, 0.3), (0.2, far), (-far, -far)):
         mapper = make_mapper(name, 0.01, (-1, -1, 1, 1))

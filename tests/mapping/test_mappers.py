@@ -1,4 +1,4 @@
-"""Both of the paper's mappers, by hand-computed cases and by what must always hold."""
+"""The paper's mappers: cases computed by hand, and properties; the reference map."""
 
 import math
 from collections.abc import Callable
@@ -14,12 +14,13 @@ from mapping.grid import OccupancyGrid
 from mapping.mapper import MAPPERS, make_mapper
 from mapping.probabilistic import (
     ProbabilisticMapper,
+    ProbabilisticOptions,
     gaussian_sensor_model,
     inverse_sensor_model,
     log_odds,
     probability_of,
 )
-from mapping.reference_map import TruthMap
+from mapping.reference_map import ReferenceMap
 from prim.errors import UsageError
 from prim.scan import Scan
 from prim.se2 import Pose2D
@@ -39,6 +40,11 @@ def row_at(grid: OccupancyGrid, y: float) -> np.ndarray:
 def test_eq_4() -> None:
     assert inverse_sensor_model(np.array([-1, -0.03, -0.02, -0.01, 0])) == pytest.approx([0.3, 0.3, 0.5, 0.7, 0.9])
     assert inverse_sensor_model(np.array([0.015, 0.03, 1])) == pytest.approx([0.7, 0.5, 0.5])
+
+
+def test_the_parameters_of_eq_4_are_options() -> None:
+    options = ProbabilisticOptions(free_probability=0.4, hit_probability=0.8, reach=0.1)
+    assert inverse_sensor_model([-0.1, -0.05, 0.0, 0.1], options) == pytest.approx([0.4, 0.6, 0.8, 0.5])
 
 
 def test_eqs_1_and_2_are_inverse() -> None:
@@ -88,7 +94,7 @@ def test_rays_that_end_on_a_border_end_in_the_cell_above_it(bearing: int, make_s
     det = DeterministicMapper(0.01, HERE)
     det.update(make_scan(0.1, angle_min=bearing * math.pi / 2), Pose2D(0.05, 0.05))
     ends = {0: (0.15, 0.05), 1: (0.05, 0.15), 2: (-0.05, 0.05), 3: (0.05, -0.05)}
-    (centre,) = det.grid().centres(det.grid().occupied)
+    (centre,) = det.grid().frame.centres(det.grid().occupied)
     assert centre == pytest.approx(np.array(ends[bearing]) + 0.005, abs=1e-9)
 
 
@@ -106,7 +112,7 @@ def test_no_return_frees_up_to_range_max_and_marks_nothing(name: str, make_scan:
 
 @both
 @pytest.mark.parametrize("z", [math.nan, -math.inf, 0.0, -1.0, 0.009])
-def test_measurements_that_are_none_change_nothing(name: str, z: float, make_scan: Callable[..., Scan]) -> None:
+def test_ranges_that_are_no_measurements_change_nothing(name: str, z: float, make_scan: Callable[..., Scan]) -> None:
     mapper = make_mapper(name, 0.01, HERE)
     mapper.update(make_scan(z), Pose2D())
     assert (mapper.grid().probability == 0.5).all()
@@ -124,13 +130,13 @@ def test_rays_from_outside_the_grid(name: str, make_scan: Callable[..., Scan]) -
 
 
 @every
-def test_what_lies_behind_is_not_touched(name: str, make_scan: Callable[..., Scan]) -> None:
+def test_cells_behind_the_laser_do_not_change(name: str, make_scan: Callable[..., Scan]) -> None:
     mapper = make_mapper(name, 0.01, HERE)
     mapper.update(make_scan(1.0), Pose2D(0.305, 0.005))
     assert (mapper.grid().probability == 0.5).all()
 
 
-def test_det_lets_the_last_scan_win(make_scan: Callable[..., Scan]) -> None:
+def test_det_keeps_the_last_scan(make_scan: Callable[..., Scan]) -> None:
     det = DeterministicMapper(0.01, HERE)
     pose = Pose2D(0.005, 0.005)
     det.update(make_scan(0.10), pose)
@@ -196,32 +202,32 @@ def test_grid_is_a_snapshot(name: str) -> None:
 
 
 def test_prob_does_not_depend_on_the_order_of_scans() -> None:
-    one, other = make_mapper("prob", 0.05, (-2, -2, 2, 2)), make_mapper("prob", 0.05, (-2, -2, 2, 2))
+    ahead, back = make_mapper("prob", 0.05, (-2, -2, 2, 2)), make_mapper("prob", 0.05, (-2, -2, 2, 2))
     scans = random_scans(3, 10)
     for scan, pose in scans:
-        one.update(scan, pose)
+        ahead.update(scan, pose)
     for scan, pose in reversed(scans):
-        other.update(scan, pose)
-    assert one.grid().probability == pytest.approx(other.grid().probability, abs=1e-5)
+        back.update(scan, pose)
+    assert ahead.grid().probability == pytest.approx(back.grid().probability, abs=1e-5)
 
 
-def test_unknown_mapper_and_too_large_a_grid() -> None:
+def test_unknown_mappers_and_too_large_grids_are_refused() -> None:
     with pytest.raises(UsageError, match="det, prob"):
         make_mapper("fancy", 0.1)
     with pytest.raises(UsageError, match="million cells"):
         make_mapper("det", 0.001, (-50, -50, 50, 50))
 
 
-def map_of(session: Session, name: str, scans: int | None = None) -> tuple[OccupancyGrid, TruthMap]:
-    """A session's map with the session's own poses, and its truth."""
-    from prim.log.mcap import LogReader
+def map_of(session: Session, name: str, scans: int | None = None) -> tuple[OccupancyGrid, ReferenceMap]:
+    """Return a session's map at the session's own poses, and its reference map."""
+    from prim.log import open_log
     from replay.posed_scans import ScanLog
     from replay.poses.localize import Localizer
     from replay.selection import Selection
 
     mapper = make_mapper(name, 0.01, (-1.1, -1.1, 1.1, 1.1))
-    truth = TruthMap(mapper.grid().frame)
-    with LogReader(session.path) as log:
+    truth = ReferenceMap(mapper.grid().frame)
+    with open_log(session.path) as log:
         scan_log = ScanLog(log, None, Selection(n_scans=scans))
         poses = Localizer(log).locate(scan_log.times, "truth")
         for position, scan in scan_log:
@@ -232,7 +238,7 @@ def map_of(session: Session, name: str, scans: int | None = None) -> tuple[Occup
 
 
 def test_det_without_noise(quiet_session: Session) -> None:
-    """Precision and free accuracy over the session; recall for one scan, since later grazing rays erase."""
+    """Precision and free accuracy of the session; recall of one scan, since later grazing rays erase cells."""
     grid, truth = map_of(quiet_session, "det")
     scores = truth.score(grid.probability)
     assert scores.occupied_precision is not None and scores.occupied_precision >= 0.99
@@ -251,16 +257,16 @@ def test_prob_without_noise(quiet_session: Session) -> None:
     assert scores.auc is not None and scores.auc >= 0.999
 
 
-def test_truth_of_an_empty_room_is_its_walls() -> None:
-    room = World((2.0, 2.0)).walled()
+def test_the_reference_map_of_an_empty_room_is_its_walls() -> None:
+    room = World((2.0, 2.0)).with_walls()
     mapper = make_mapper("det", 0.01, (-1.1, -1.1, 1.1, 1.1))
-    truth = TruthMap(mapper.grid().frame)
+    truth = ReferenceMap(mapper.grid().frame)
     lidar = Lidar(noise_std=0.0, rays=4000)
     scan = lidar.measure(room, Pose2D(0.003, 0.004), 0, 0.1, np.random.default_rng(0))
     truth.update(scan, Pose2D(0.003, 0.004), room)
-    centres = mapper.grid().centres(truth.occupied)
+    centres = mapper.grid().frame.centres(truth.occupied)
     assert np.abs(np.abs(centres).max(axis=1) - 1.0).max() <= 0.0051
-    assert np.abs(mapper.grid().centres(truth.free)).max() < 0.99
+    assert np.abs(mapper.grid().frame.centres(truth.free)).max() < 0.99
     assert not (truth.occupied & truth.free).any()
 
 
@@ -284,7 +290,7 @@ def test_the_gaussian_map_is_the_model_along_a_ray() -> None:
 
 
 @pytest.mark.parametrize(("first_beam", "state"), [(1, 1.0), (0, 0.0)])
-def test_the_end_points_of_a_scan_come_after_the_rays_of_all_its_parts(
+def test_end_points_of_a_scan_are_marked_after_the_rays_of_all_its_pieces(
     make_scan: Callable[..., Scan], first_beam: int, state: float
 ) -> None:
     mapper = DeterministicMapper(0.02, (-1.0, -1.0, 1.0, 1.0))

@@ -1,4 +1,4 @@
-"""The forward sensor model in plain Python and double precision, written from DESIGN and not from the kernels."""
+"""The forward sensor model in plain Python and double precision, written independently of the kernels."""
 
 from __future__ import annotations
 
@@ -7,10 +7,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-BEYOND, WILD_TAIL = 0.5, 0.1
+HIT_BEFORE, HIT_BEYOND, OUTLIER_TAIL = 0.5, 0.5, 0.1
 
 
-def phi(x: float) -> float:
+def pdf(x: float) -> float:
     return math.exp(-x * x / 2) / math.sqrt(2 * math.pi)
 
 
@@ -19,11 +19,11 @@ def cdf(x: float) -> float:
 
 
 def cdf_integral(x: float) -> float:
-    return x * cdf(x) + phi(x)
+    return x * cdf(x) + pdf(x)
 
 
 def cells_of(x: float, y: float, angle: float, shape: tuple[int, int]) -> tuple[list[tuple[int, int, float]], float]:
-    """(row, col, distance) in cells, one for each step along the major axis, and where the ray leaves the grid."""
+    """Return (row, col, distance) in cells for each step along the major axis, and where the ray leaves the grid."""
     dx, dy = math.cos(angle), math.sin(angle)
     along_x = abs(dx) >= abs(dy)
     a, b, da, db = (x, y, dx, dy) if along_x else (y, x, dy, dx)
@@ -43,15 +43,15 @@ def cells_of(x: float, y: float, angle: float, shape: tuple[int, int]) -> tuple[
 
 @dataclass
 class Sums:
-    """Expected hits and passes per cell, and what the noise is found from."""
+    """Expected hits and passes per cell, and the sufficient statistics of the noise."""
 
     hits: np.ndarray
     passes: np.ndarray
-    certain: np.ndarray
+    squares_of_arrival: np.ndarray
     log_likelihood: float = 0.0
     stops: float = 0.0
     squares: float = 0.0
-    wild: float = 0.0
+    outliers: float = 0.0
     worst_sum: float = 0.0
 
 
@@ -62,7 +62,7 @@ def expect(
     sigma: float,
     epsilon: float,
 ) -> Sums:
-    """The E step; rays are x, y, bearing and range, all lengths in cells. Densities are per cell."""
+    """Compute the E step; rays are x, y, bearing and range, all lengths in cells. Densities are per cell."""
     sums = Sums(np.zeros_like(o), np.zeros_like(o), np.zeros_like(o))
     z_min, z_max = limits
     for x, y, angle, z in rays:
@@ -73,49 +73,49 @@ def expect(
         outside = not (0 <= x < o.shape[1] and 0 <= y < o.shape[0])
         half = 0.5 / max(abs(math.cos(angle)), abs(math.sin(angle)))
         entry = cells[0][2] - half if outside else 0.0
-        left, parts, squares = 0.5 if entry > 0 else 1.0, [], []
+        left, parts, squares = 1 - HIT_BEFORE if entry > 0 else 1.0, [], []
         for row, col, s in cells:
             if none and s > z_max:
                 break
             if near:
                 u = (z_min - s) / sigma
-                weight, square = cdf(u), 1 - u * phi(u) / max(cdf(u), 1e-300)
+                weight, square = cdf(u), 1 - u * pdf(u) / max(cdf(u), 1e-300)
             elif none:
                 u = (z_max - s) / sigma
-                weight, square = cdf(-u), 1 + u * phi(u) / max(cdf(-u), 1e-300)
+                weight, square = cdf(-u), 1 + u * pdf(u) / max(cdf(-u), 1e-300)
             else:
-                weight, square = phi((z - s) / sigma) / sigma, ((z - s) / sigma) ** 2
+                weight, square = pdf((z - s) / sigma) / sigma, ((z - s) / sigma) ** 2
             parts.append(left * o[row, col] * weight)
             squares.append(square)
             left *= 1 - o[row, col]
         gone = left * _beyond(z, near, none, leaves, z_min, z_max, sigma)
-        wild = epsilon * (WILD_TAIL if near or none else (1 - 2 * WILD_TAIL) / (z_max - z_min))
-        density = (1 - epsilon) * (sum(parts) + gone + _before(z, near, none, entry, z_min, z_max, sigma)) + wild
+        outlier = epsilon * (OUTLIER_TAIL if near or none else (1 - 2 * OUTLIER_TAIL) / (z_max - z_min))
+        density = (1 - epsilon) * (sum(parts) + gone + _before(z, near, none, entry, z_min, z_max, sigma)) + outlier
         q = [(1 - epsilon) * part / density for part in parts]
         behind = (1 - epsilon) * gone / density
         stopped_before = (1 - epsilon) * _before(z, near, none, entry, z_min, z_max, sigma) / density
-        sums.worst_sum = max(sums.worst_sum, abs(sum(q) + behind + stopped_before + wild / density - 1))
+        sums.worst_sum = max(sums.worst_sum, abs(sum(q) + behind + stopped_before + outlier / density - 1))
         for (row, col, _), share in reversed(list(zip(cells, q, strict=False))):
             sums.hits[row, col] += share
             sums.passes[row, col] += behind
             behind += share
-            sums.certain[row, col] += behind**2
+            sums.squares_of_arrival[row, col] += behind**2
         sums.log_likelihood += math.log(density)
         sums.stops += sum(q)
         sums.squares += sum(share * square for share, square in zip(q, squares, strict=True))
-        sums.wild += wild / density
+        sums.outliers += outlier / density
     return sums
 
 
 def _before(z: float, near: bool, none: bool, entry: float, z_min: float, z_max: float, sigma: float) -> float:
-    """Half of the rays from off the grid are stopped anywhere before it."""
+    """Return the likelihood of a ray from off the grid that ends before it, uniformly."""
     if entry <= 0:
         return 0.0
     if not near and not none:
-        return 0.5 * (cdf(z / sigma) - cdf((z - entry) / sigma)) / entry
+        return HIT_BEFORE * (cdf(z / sigma) - cdf((z - entry) / sigma)) / entry
     limit = z_min if near else z_max
     nearer = sigma * (cdf_integral(limit / sigma) - cdf_integral((limit - entry) / sigma)) / entry
-    return 0.5 * (nearer if near else 1 - nearer)
+    return HIT_BEFORE * (nearer if near else 1 - nearer)
 
 
 def _beyond(z: float, near: bool, none: bool, leaves: float, z_min: float, z_max: float, sigma: float) -> float:
@@ -124,7 +124,7 @@ def _beyond(z: float, near: bool, none: bool, leaves: float, z_min: float, z_max
     span = z_max - leaves
     if near:
         below = cdf_integral((z_min - leaves) / sigma) - cdf_integral((z_min - z_max) / sigma)
-        return BEYOND * sigma * below / span
+        return HIT_BEYOND * sigma * below / span
     if none:
-        return 1 - BEYOND * sigma * (cdf_integral(span / sigma) - cdf_integral(0)) / span
-    return BEYOND * (cdf((z - leaves) / sigma) - cdf((z - z_max) / sigma)) / span
+        return 1 - HIT_BEYOND * sigma * (cdf_integral(span / sigma) - cdf_integral(0)) / span
+    return HIT_BEYOND * (cdf((z - leaves) / sigma) - cdf((z - z_max) / sigma)) / span

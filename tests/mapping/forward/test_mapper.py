@@ -1,4 +1,4 @@
-"""The forward mapper: its sensor model against a plain reference, its likelihood, its noise, its maps."""
+"""Forward mapper: the sensor model against a plain reference, the likelihood, the range noise, the maps."""
 
 from __future__ import annotations
 
@@ -15,10 +15,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from bench.sessions import Session, recorded
-from mapping.forward.calibration import known
-from mapping.forward.level import ALL, Choice, Level, Noise, Rays, smoothing_width
-from mapping.forward.mapper import ForwardMapper, coarser, find_noise
-from mapping.forward.sieve import taps
+from mapping.forward.calibration import is_known
+from mapping.forward.level import ALL_RAYS, Fold, Level, RangeNoise, RayStore, RaySubset, smoothing_width
+from mapping.forward.mapper import ForwardMapper, coarsened, estimate_noise, level_factors
+from mapping.forward.options import ForwardOptions
+from mapping.forward.sieve import gaussian_kernel
 from mapping.grid import GridFrame
 from mapping.map_metrics import map_scores
 from prim.errors import UsageError
@@ -33,8 +34,8 @@ FRAME = GridFrame(1.0, 0, 0, SIZE, SIZE)
 LIMITS = (0.5, 30.0)
 
 
-def a_map(rng: np.random.Generator, thick: bool = False) -> np.ndarray:
-    """Stopping chances of a random world: a few solid cells and much that is nearly free."""
+def random_stopping(rng: np.random.Generator, thick: bool = False) -> np.ndarray:
+    """Return stopping probabilities of a random world: a few solid cells, the others nearly free."""
     o = rng.uniform(1e-6, 0.05, (SIZE, SIZE))
     o[rng.random((SIZE, SIZE)) < 0.08] = 0.9
     if thick:
@@ -42,20 +43,22 @@ def a_map(rng: np.random.Generator, thick: bool = False) -> np.ndarray:
     return o.astype(np.float32)
 
 
-def a_scan(ranges: list[float], angle_min: float, increment: float) -> Scan:
+def scan_with(ranges: list[float], angle_min: float, increment: float) -> Scan:
     return Scan(0, "laser", angle_min, increment, *LIMITS, np.array(ranges, dtype=np.float32))
 
 
-def random_rays(rng: np.random.Generator, scans: int = 6, beams: int = 15) -> tuple[Rays, list[tuple[float, ...]]]:
-    """Rays of all kinds for the kernels and for the reference, some from outside the grid."""
-    rays, plain = Rays(), []
+def random_rays(
+    rng: np.random.Generator, scans: int = 6, beams: int = 15
+) -> tuple[RayStore, list[tuple[float, ...]]]:
+    """Return rays of all kinds for the kernels and for the reference, some from outside the grid."""
+    rays, plain = RayStore(), []
     for _ in range(scans):
         x, y = rng.uniform(-4, SIZE + 4, 2)
         theta = rng.uniform(-3, 3)
         ranges = rng.uniform(LIMITS[0], 28, beams)
         ranges[rng.random(beams) < 0.15] = np.inf
         ranges[rng.random(beams) < 0.15] = -np.inf
-        scan = a_scan(ranges.tolist(), -3.0, 6.0 / beams)
+        scan = scan_with(ranges.tolist(), -3.0, 6.0 / beams)
         rays.add(scan, Pose2D(x, y, theta))
         plain += [(x, y, theta - 3.0 + i * 6.0 / beams, float(scan.ranges[i])) for i in range(beams)]
     return rays, plain
@@ -63,54 +66,54 @@ def random_rays(rng: np.random.Generator, scans: int = 6, beams: int = 15) -> tu
 
 def level_of(o: np.ndarray) -> Level:
     level = Level(FRAME, 0.1)
-    level.restore(o)
+    level.set_parameters(o)
     return level
 
 
 @settings(max_examples=30)
 @given(seed=st.integers(0, 10**6), sigma=st.floats(0.4, 8))
-def test_the_e_step_is_the_reference_s(seed: int, sigma: float) -> None:
+def test_the_e_step_agrees_with_the_reference(seed: int, sigma: float) -> None:
     rng = np.random.default_rng(seed)
-    o = a_map(rng)
+    o = random_stopping(rng)
     rays, plain = random_rays(rng)
-    sums, totals = level_of(o).expect(rays, Noise(sigma, 0.01), certain=True)
+    sums, statistics = level_of(o).expect(rays, RangeNoise(sigma, 0.01), with_certainty=True)
     expected = reference.expect(plain, LIMITS, o.astype(float), sigma, 0.01)
     found = sums.sum(axis=0).reshape(SIZE, SIZE, 3)
     assert expected.worst_sum < 1e-12
     assert found[..., 0] == pytest.approx(expected.hits, abs=0.02)
     assert found[..., 1] == pytest.approx(expected.passes, abs=0.02)
-    assert found[..., 2] == pytest.approx(expected.certain, abs=0.02)
-    assert totals.log_likelihood == pytest.approx(expected.log_likelihood, abs=1e-3 * totals.rays)
-    assert totals.stops == pytest.approx(expected.stops, abs=0.02)
-    assert totals.squares == pytest.approx(expected.squares, rel=5e-3, abs=0.02)
-    assert totals.wild == pytest.approx(expected.wild, rel=5e-3, abs=1e-3)
+    assert found[..., 2] == pytest.approx(expected.squares_of_arrival, abs=0.02)
+    assert statistics.log_likelihood == pytest.approx(expected.log_likelihood, abs=1e-3 * statistics.rays)
+    assert statistics.stops == pytest.approx(expected.stops, abs=0.02)
+    assert statistics.squares == pytest.approx(expected.squares, rel=5e-3, abs=0.02)
+    assert statistics.outliers == pytest.approx(expected.outliers, rel=5e-3, abs=1e-3)
 
 
 @pytest.mark.parametrize("sigma", [0.3, 2.0, 7.0])
 @pytest.mark.parametrize(
     ("x", "y", "angle"), [(11.3, 12.8, 0.0), (11.3, 12.8, 0.7), (11.3, 12.8, -1.9), (-3.0, 5.0, 0.3)]
 )
-def test_a_ray_s_density_is_normalised(sigma: float, x: float, y: float, angle: float) -> None:
-    o = a_map(np.random.default_rng(5)) * 0.3
+def test_the_density_of_a_ray_is_normalised(sigma: float, x: float, y: float, angle: float) -> None:
+    o = random_stopping(np.random.default_rng(5)) * 0.3
     edges = np.linspace(LIMITS[0], LIMITS[1], 3001)
     middles = (edges[:-1] + edges[1:]) / 2
     total = 0.0
     for z in (*middles, -np.inf, np.inf):
-        rays = Rays()
-        rays.add(a_scan([z], angle, 0.0), Pose2D(x, y))
-        _, totals = level_of(o).expect(rays, Noise(sigma, 0.05))
-        total += math.exp(totals.log_likelihood) * (edges[1] - edges[0] if np.isfinite(z) else 1)
+        rays = RayStore()
+        rays.add(scan_with([z], angle, 0.0), Pose2D(x, y))
+        _, statistics = level_of(o).expect(rays, RangeNoise(sigma, 0.05))
+        total += math.exp(statistics.log_likelihood) * (edges[1] - edges[0] if np.isfinite(z) else 1)
     assert total == pytest.approx(1, abs=2e-3)
 
 
 def test_the_m_step_of_the_sieve_is_exact() -> None:
-    """Against the sieve written as one matrix, borders and all."""
+    """Compare with the sieve as one dense matrix, borders included."""
     rng = np.random.default_rng(4)
     level = Level(FRAME, 0.1)
     level.smooth(20.0)
     p = rng.uniform(0.01, 0.9, (SIZE, SIZE)).astype(np.float32)
-    level.restore(p.copy())
-    weights = taps(smoothing_width(20.0, 1.0))
+    level.set_parameters(p.copy())
+    weights = gaussian_kernel(smoothing_width(20.0, 1.0))
     n = len(weights) // 2
     line = np.array([[weights[n + j - i] if abs(i - j) <= n else 0.0 for j in range(SIZE)] for i in range(SIZE)])
     line /= line.sum(axis=1, keepdims=True)
@@ -124,52 +127,52 @@ def test_the_m_step_of_the_sieve_is_exact() -> None:
     assert level.parameters.ravel() == pytest.approx(up / (up + down), rel=1e-3)
 
 
-def test_responsibilities_sum_to_1_within_walls() -> None:
+def test_responsibilities_sum_to_1_in_a_closed_room() -> None:
     rng = np.random.default_rng(1)
-    o = a_map(rng, thick=True)
-    rays = Rays()
-    rays.add(a_scan(rng.uniform(1, 14, 200).tolist(), -3.1, 0.031), Pose2D(12.0, 11.0))
-    _, totals = level_of(o).expect(rays, Noise(3.0, 0.01))
-    assert totals.stops + totals.wild == pytest.approx(totals.rays, abs=0.01)
+    o = random_stopping(rng, thick=True)
+    rays = RayStore()
+    rays.add(scan_with(rng.uniform(1, 14, 200).tolist(), -3.1, 0.031), Pose2D(12.0, 11.0))
+    _, statistics = level_of(o).expect(rays, RangeNoise(3.0, 0.01))
+    assert statistics.stops + statistics.outliers == pytest.approx(statistics.rays, abs=0.01)
 
 
-def climb_of_reference(plain: list[tuple[float, ...]], passes: int) -> list[float]:
-    """Log-likelihoods of plain expectation-maximisation in double precision."""
+def reference_log_likelihoods(plain: list[tuple[float, ...]], passes: int) -> list[float]:
+    """Return the log-likelihood at each pass of plain expectation-maximisation in double precision."""
     o, sigma, epsilon = np.full((SIZE, SIZE), 0.05), 3.0, 0.01
-    climb = []
+    log_likelihoods = []
     for _ in range(passes):
         sums = reference.expect(plain, LIMITS, o, sigma, epsilon)
-        climb.append(sums.log_likelihood)
+        log_likelihoods.append(sums.log_likelihood)
         visited = sums.hits + sums.passes
         o = np.where(visited > 0, sums.hits / np.maximum(visited, 1e-300), o)
         sigma *= math.sqrt(sums.squares / sums.stops)
-        epsilon = sums.wild / len(plain)
-    return climb
+        epsilon = sums.outliers / len(plain)
+    return log_likelihoods
 
 
 @settings(max_examples=5)
 @given(seed=st.integers(0, 10**6))
-def test_the_reference_s_likelihood_never_falls(seed: int) -> None:
+def test_the_likelihood_of_the_reference_never_falls(seed: int) -> None:
     _, plain = random_rays(np.random.default_rng(seed), scans=4, beams=12)
-    climb = np.array(climb_of_reference(plain, 12))
-    assert (np.diff(climb) >= -1e-9 * np.abs(climb[:-1])).all()
+    log_likelihoods = np.array(reference_log_likelihoods(plain, 12))
+    assert (np.diff(log_likelihoods) >= -1e-9 * np.abs(log_likelihoods[:-1])).all()
 
 
 @settings(max_examples=25)
 @given(seed=st.integers(0, 10**6), width=st.sampled_from([0.0, 0.5, 4.0]))
 def test_the_likelihood_never_falls(seed: int, width: float) -> None:
-    """With the sieve and with learned noise and wild share; ``width`` is the noise that the sieve is made for."""
+    """With the sieve, and noise and outlier share estimated; ``width`` is the noise that the sieve is set for."""
     rays, _ = random_rays(np.random.default_rng(seed), scans=12, beams=30)
-    level, noise = Level(FRAME, 0.05), Noise(3.0, 0.01)
+    level, noise = Level(FRAME, 0.05), RangeNoise(3.0, 0.01)
     level.smooth(width)
-    climb = []
+    log_likelihoods = []
     for _ in range(25):
-        sums, totals = level.expect(rays, noise)
-        climb.append(totals.log_likelihood)
+        sums, statistics = level.expect(rays, noise)
+        log_likelihoods.append(statistics.log_likelihood)
         level.maximize(sums)
-        noise = totals.noise(noise, 1.0)
-    assert (np.diff(climb) >= -1e-5 * np.abs(climb[:-1])).all()
-    assert climb[-1] > climb[0]
+        noise = statistics.range_noise(noise, 1.0)
+    assert (np.diff(log_likelihoods) >= -1e-5 * np.abs(log_likelihoods[:-1])).all()
+    assert log_likelihoods[-1] > log_likelihoods[0]
 
 
 def session_of(noise_std: float, seed: int = 3) -> Session:
@@ -181,19 +184,19 @@ def noisiest() -> Session:
     return session_of(0.5)
 
 
-def mapper_of(session: Session, **options: float) -> ForwardMapper:
-    mapper = ForwardMapper(session.frame.resolution, session.frame.bounds, **options)  # type: ignore[arg-type]
+def mapper_of(session: Session, **arguments: float | ForwardOptions) -> ForwardMapper:
+    mapper = ForwardMapper(session.frame.resolution, session.frame.bounds, **arguments)  # type: ignore[arg-type]
     for scan, pose in session.scans:
-        mapper.keep(scan, pose)
+        mapper.accumulate(scan, pose)
     return mapper
 
 
 GOALS = {0.05: (0.95, 0.95), 0.1: (0.95, 0.95), 0.25: (0.8, 0.95), 0.5: (0.6, 0.85)}
-"""F1 within one cell and within three, per noise."""
+"""F1 within one cell and within three, per noise (m)."""
 
 
 @pytest.mark.parametrize("noise_std", GOALS)
-def test_maps_survive_the_noise_and_the_noise_is_found(noise_std: float) -> None:
+def test_maps_are_accurate_and_the_noise_is_estimated(noise_std: float) -> None:
     session = session_of(noise_std)
     mapper = mapper_of(session)
     grid = mapper.finish()
@@ -206,35 +209,34 @@ def test_maps_survive_the_noise_and_the_noise_is_found(noise_std: float) -> None
         assert scores.auc is not None and scores.auc > 0.97
 
 
-def test_small_noise_is_found() -> None:
+def test_small_noise_is_estimated() -> None:
     mapper = mapper_of(session_of(0.02))
     mapper.finish()
     assert mapper.noise_std == pytest.approx(0.02, rel=0.05)
 
 
 @pytest.mark.parametrize("start_std", [0.01, 0.1, 1.0])
-def test_the_start_does_not_matter(start_std: float, noisiest: Session) -> None:
+def test_the_estimated_noise_does_not_depend_on_the_initial_value(start_std: float, noisiest: Session) -> None:
     mapper = mapper_of(noisiest, start_std=start_std)
     mapper.finish()
     assert mapper.noise_std == pytest.approx(0.5, rel=0.03)
 
 
-def test_given_noise_is_kept(noisiest: Session) -> None:
+def test_given_noise_is_held_fixed(noisiest: Session) -> None:
     mapper = mapper_of(noisiest, noise_std=0.4)
     mapper.finish()
     assert mapper.noise_std == 0.4
 
 
 def test_any_number_of_threads_gives_the_same_bits(noisiest: Session) -> None:
-    one, three = mapper_of(noisiest, threads=1), mapper_of(noisiest, threads=3)
-    first, second = one.finish(), three.finish()
-    assert first.probability.tobytes() == second.probability.tobytes()
-    assert one.noise_std == three.noise_std
+    single, threaded = mapper_of(noisiest, threads=1), mapper_of(noisiest, threads=3)
+    assert single.finish().probability.tobytes() == threaded.finish().probability.tobytes()
+    assert single.noise_std == threaded.noise_std
 
 
 @pytest.mark.slow
 def test_code_from_the_cache_gives_the_same_bits_as_fresh_code(tmp_path: Path) -> None:
-    """What the compiler makes of the kernels must not depend on whether it had made parts of them before."""
+    """Machine code of the kernels must not depend on whether parts of them were compiled before."""
     program = (
         "import hashlib\n"
         "from tests.mapping.forward.test_mapper import mapper_of, session_of\n"
@@ -248,16 +250,16 @@ def test_code_from_the_cache_gives_the_same_bits_as_fresh_code(tmp_path: Path) -
     assert len(printed) == 1
 
 
-def test_cut_off_ranges_are_counted(noisiest: Session) -> None:
-    """Dropping what read as too near, as the paper's mappers do, would find a noise that is too small."""
+def test_censored_ranges_are_needed_for_the_noise(noisiest: Session) -> None:
+    """Without ranges below range_min, which the paper's mappers skip, the noise is underestimated."""
     dropped = [
         (replace(scan, ranges=np.where(np.isneginf(scan.ranges), np.float32(np.nan), scan.ranges)), pose)
         for scan, pose in noisiest.scans
     ]
-    assert find_noise(dropped, noisiest.frame) < 0.47
+    assert estimate_noise(dropped, noisiest.frame) < 0.47
 
 
-def test_streaming_follows_and_the_end_does_not_depend_on_it(noisiest: Session) -> None:
+def test_the_streaming_map_improves_and_the_final_map_does_not_depend_on_it(noisiest: Session) -> None:
     streaming = ForwardMapper(0.01, noisiest.frame.bounds)
     assert (streaming.grid().probability == 0.5).all()
     aucs = []
@@ -275,7 +277,7 @@ def box_scans(z: np.ndarray, count: int = 20) -> list[tuple[Scan, Pose2D]]:
     return [(scan, Pose2D(0.1 * i / count, 0.0, 0.01 * i)) for i in range(count)]
 
 
-def test_no_walls_at_all() -> None:
+def test_a_world_without_walls_is_free() -> None:
     mapper = ForwardMapper(0.05, (-2, -2, 2, 2))
     for scan, pose in box_scans(np.full(200, np.inf)):
         mapper.update(scan, pose)
@@ -284,7 +286,7 @@ def test_no_walls_at_all() -> None:
     assert grid.free.mean() > 0.95
 
 
-def test_nothing_measured_is_unknown() -> None:
+def test_maps_without_measurements_are_unknown() -> None:
     mapper = ForwardMapper(0.05, (-2, -2, 2, 2))
     for scan, pose in box_scans(np.full(100, np.nan), 3):
         mapper.update(scan, pose)
@@ -292,15 +294,15 @@ def test_nothing_measured_is_unknown() -> None:
     assert (ForwardMapper(0.05, (-1, -1, 1, 1)).finish().probability == 0.5).all()
 
 
-def test_numbers_below_range_min_say_nothing() -> None:
-    rays = Rays()
+def test_finite_ranges_below_range_min_are_not_used() -> None:
+    rays = RayStore()
     scan = Scan(0, "laser", 0.0, 0.1, 0.5, 10.0, np.array([0.0, 0.3, -1.0, np.nan, 0.7, -np.inf, 12.0], np.float32))
     assert rays.add(scan, Pose2D()) == 3
-    assert rays.rays[:, 2].tolist() == [np.float32(0.7), -np.inf, np.inf]
+    assert rays.ranges.tolist() == [np.float32(0.7), -np.inf, np.inf]
 
 
-def test_what_no_ray_reached_is_unknown() -> None:
-    """A wall of one side: beyond it nothing is known, before it all is free."""
+def test_cells_that_no_ray_reached_are_unknown() -> None:
+    """A single wall: unknown behind it, free before it."""
     angles = np.linspace(-0.5, 0.5, 200)
     scan = Scan(0, "laser", -0.5, angles[1] - angles[0], 0.05, 10.0, (1.0 / np.cos(angles)).astype(np.float32))
     mapper = ForwardMapper(0.05, (-2, -2, 2, 2))
@@ -312,39 +314,39 @@ def test_what_no_ray_reached_is_unknown() -> None:
     assert (row[:35] == 0.5).all() and (row[42:58] < 0.1).all() and row[60] > 0.9 and (row[66:] == 0.5).all()
 
 
-def test_a_few_wild_ranges_leave_no_mark() -> None:
+def test_a_few_outliers_leave_no_occupied_cells() -> None:
     rng = np.random.default_rng(0)
     scans = box_scans(np.full(360, 1.0) + 0.01 * rng.standard_normal(360), 30)
-    spoiled = []
+    with_outliers = []
     for scan, pose in scans:
         ranges = scan.ranges.copy()
         ranges[rng.integers(0, 360, 7)] = rng.uniform(0.1, 0.8, 7)
-        spoiled.append((replace(scan, ranges=ranges), pose))
+        with_outliers.append((replace(scan, ranges=ranges), pose))
     mapper = ForwardMapper(0.02, (-1.3, -1.3, 1.3, 1.3))
-    for scan, pose in spoiled:
-        mapper.keep(scan, pose)
+    for scan, pose in with_outliers:
+        mapper.accumulate(scan, pose)
     grid = mapper.finish()
-    inside = grid.centres(grid.occupied)
+    inside = grid.frame.centres(grid.occupied)
     assert (np.hypot(*inside.T) > 0.85).all()
-    assert mapper.wild_share == pytest.approx(7 / 360, rel=0.4)
+    assert mapper.outlier_share == pytest.approx(7 / 360, rel=0.4)
     assert mapper.noise_std < 0.03
 
 
-def test_a_map_that_grows_is_the_one_with_bounds() -> None:
-    """While it streams, its cells become coarser as it grows; at the end it is the same map."""
+def test_a_map_that_grows_equals_one_with_bounds() -> None:
+    """The streaming map's cells become coarser as it grows; the final map is the same."""
     rooms = [np.full(200, size) for size in (1.0, 1.5, 3.0, 6.0)]
     growing, bounded = ForwardMapper(0.02), ForwardMapper(0.02, (-7, -7, 7, 7))
     for room in rooms:
         for scan, pose in box_scans(room, 4):
             growing.update(scan, pose)
-            bounded.keep(scan, pose)
+            bounded.accumulate(scan, pose)
             assert growing.grid().probability.shape == growing.grid().frame.shape
     small, large = growing.finish(), bounded.finish()
-    apart = np.abs(large.probability[large.frame.window(small.frame)] - small.probability)
-    assert np.mean(apart < 0.2) > 0.9999  # but for a few cells at the border
+    difference = np.abs(large.probability[large.frame.window(small.frame)] - small.probability)
+    assert np.mean(difference < 0.2) > 0.9999  # all but a few cells at the border
 
 
-def test_noise_is_not_told_where_nothing_was_hit(noisiest: Session) -> None:
+def test_noise_is_none_where_no_ray_stopped(noisiest: Session) -> None:
     far = ForwardMapper(0.05, (500, 500, 505, 505))
     for scan, pose in noisiest.scans[:10]:
         far.update(scan, pose)
@@ -352,7 +354,7 @@ def test_noise_is_not_told_where_nothing_was_hit(noisiest: Session) -> None:
     assert far.noise_std is None and ForwardMapper(0.05).noise_std is None
 
 
-def test_noise_that_is_given_far_too_small_leaves_a_map() -> None:
+def test_given_noise_that_is_far_too_small_still_gives_a_map() -> None:
     session = session_of(0.02)
     mapper = mapper_of(session, noise_std=1e-6)
     assert session.truth is not None
@@ -362,55 +364,58 @@ def test_noise_that_is_given_far_too_small_leaves_a_map() -> None:
         ForwardMapper(0.01, noise_std=0.0)
 
 
-def test_rays_that_end_before_the_grid_say_nothing() -> None:
+def test_rays_that_end_before_the_grid_leave_it_unknown() -> None:
     mapper = ForwardMapper(0.02, (2, -0.5, 3, 0.5))
     for scan, pose in box_scans(np.full(360, 1.0), 10):
-        mapper.keep(scan, pose)
+        mapper.accumulate(scan, pose)
     assert (mapper.finish().probability == 0.5).all()
-    assert mapper.wild_share < 0.01
+    assert mapper.outlier_share < 0.01
 
 
-def test_a_map_too_large_for_the_memory() -> None:
+def test_maps_that_are_too_large_for_memory_are_refused() -> None:
     with pytest.raises(UsageError, match="million cells"):
         ForwardMapper(0.001, (-5, -5, 5, 5))
 
 
-def test_held_out_rays_are_every_fifth() -> None:
+def test_a_fifth_of_the_rays_is_held_out() -> None:
     rays, plain = random_rays(np.random.default_rng(2))
-    level = level_of(a_map(np.random.default_rng(3)))
-    counts = [level.expect(rays, Noise(1.0), Choice(held_out=held))[1].rays for held in (0, 1, -1)]
+    level = level_of(random_stopping(np.random.default_rng(3)))
+    counts = [
+        level.expect(rays, RangeNoise(1.0, 1e-4), RaySubset(fold=fold))[1].rays
+        for fold in (Fold.ALL, Fold.FITTED, Fold.HELD_OUT)
+    ]
     assert counts[0] == counts[1] + counts[2] and counts[2] == pytest.approx(len(plain) / 5, abs=12)
 
 
 def test_a_coarser_level_covers_the_finer_one() -> None:
     frame = GridFrame(0.1, -7, 3, 20, 33)
-    coarse = coarser(frame, 4)
+    coarse = coarsened(frame, 4)
     x0, y0, x1, y1 = coarse.bounds
     assert x0 <= frame.bounds[0] and y0 <= frame.bounds[1] and x1 >= frame.bounds[2] and y1 >= frame.bounds[3]
     fine, level = Level(frame, 0.5), Level(coarse, 0.5)
-    level.restore(np.arange(level.parameters.size, dtype=np.float32).reshape(coarse.shape) / 1000)
-    fine.start_from(level)
+    level.set_parameters(np.arange(level.parameters.size, dtype=np.float32).reshape(coarse.shape) / 1000)
+    fine.initialize_from(level)
     assert fine.parameters[7, 1] == pytest.approx(1 - (1 - level.parameters[2, 1]) ** 0.25, rel=1e-4)
 
 
-def test_cells_that_are_left_free_change_nothing(noisiest: Session) -> None:
-    """Passing over the free cells where rays begin gives what walking them would."""
+def test_skipping_fixed_free_cells_does_not_change_the_e_step(noisiest: Session) -> None:
+    """Skipping fixed free cells where rays begin gives the same as traversing them."""
     mapper = mapper_of(noisiest)
     fit = mapper.fit()
     level = Level(noisiest.frame, 0.02)
     level.smooth(0.5)
-    level.restore(np.where(fit.stopping > 0.01, fit.stopping, np.float32(0)))
-    walked = level.expect(mapper._rays, Noise(0.5), ALL)
-    level.keep_free(mapper._rays)
-    passed = level.expect(mapper._rays, Noise(0.5), ALL)
-    assert passed[1].log_likelihood == pytest.approx(walked[1].log_likelihood, rel=1e-5)
+    level.set_parameters(np.where(fit.stopping > 0.01, fit.stopping, np.float32(0)))
+    traversed = level.expect(mapper._rays, RangeNoise(0.5, 1e-4), ALL_RAYS)
+    level.fix_free_cells(mapper._rays)
+    skipped = level.expect(mapper._rays, RangeNoise(0.5, 1e-4), ALL_RAYS)
+    assert skipped[1].log_likelihood == pytest.approx(traversed[1].log_likelihood, rel=1e-5)
     active = level.stopping > 1e-6
-    hits = [found[0].sum(axis=0)[:, 0].reshape(noisiest.frame.shape)[active] for found in (walked, passed)]
+    hits = [found[0].sum(axis=0)[:, 0].reshape(noisiest.frame.shape)[active] for found in (traversed, skipped)]
     assert hits[1] == pytest.approx(hits[0], rel=2e-3, abs=1e-3)
 
 
-def test_known_needs_half_a_certain_ray() -> None:
-    assert known(np.array([1.0, 0.01], np.float32), np.array([0.5, 10.0], np.float32)).tolist() == [True, False]
+def test_a_known_cell_needs_half_a_certain_ray() -> None:
+    assert is_known(np.array([1.0, 0.01], np.float32), np.array([0.5, 10.0], np.float32)).tolist() == [True, False]
 
 
 def test_the_image_of_a_grid(noisiest: Session) -> None:
@@ -420,3 +425,24 @@ def test_the_image_of_a_grid(noisiest: Session) -> None:
     assert (image[..., 2] == np.where(grid.probability == 0.5, 0, 255)).all()
     assert image[grid.probability > 0.99][:, 0].min() > 250
     assert (np.diff(image[..., 1].ravel()[np.argsort(grid.evidence.ravel())].astype(int)) >= 0).all()  # type: ignore[union-attr]
+
+
+@pytest.mark.parametrize(("noise_cells", "factors"), [(1.0, [4, 2, 1]), (16.0, [4, 2, 1]), (16.5, [8, 4, 2, 1])])
+def test_levels_by_the_noise(noise_cells: float, factors: list[int]) -> None:
+    assert level_factors(noise_cells) == factors
+
+
+@pytest.mark.parametrize("every", [2, 10])
+def test_the_share_of_held_out_rays_is_an_option(every: int) -> None:
+    rays, _ = random_rays(np.random.default_rng(2), scans=200)
+    level, noise = Level(FRAME, 0.1, options=ForwardOptions(hold_out_every=every)), RangeNoise(1.0, 1e-4)
+    counts = [level.expect(rays, noise, RaySubset(fold=fold))[1].rays for fold in (Fold.HELD_OUT, Fold.ALL)]
+    assert counts[0] == pytest.approx(counts[1] / every, rel=0.1)
+
+
+def test_plain_steps_raise_the_likelihood_of_every_pass(noisiest: Session) -> None:
+    options = ForwardOptions(over_relaxation=1, hold_out_min_rays=10**9, thinning_rays=10**9)
+    mapper = mapper_of(noisiest, options=options)
+    mapper.finish()
+    finest = [statistics.log_likelihood for factor, statistics in mapper.history if factor == 1]
+    assert len(finest) > 2 and (np.diff(finest) > 0).all()
