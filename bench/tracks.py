@@ -24,7 +24,7 @@ from recorder.session import SessionOptions, record_session
 from replay.detection import DetectionResult
 from replay.options import ReplayOptions
 from replay.pipeline import Pipeline
-from replay.viewer_protocol import NullViewer
+from replay.viewing.protocol import NullViewer
 
 FIRST_SEED = 70_000
 

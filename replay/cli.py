@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from replay.options import ReplayOptions
     from replay.poses.fusion_options import FusionInputs
     from replay.result import ReplayResult
-    from replay.viewer_protocol import Viewer, ViewerOptions
+    from replay.viewing.protocol import Viewer, ViewerOptions
 
 PARTLY_LOST = 3
 """The exit code when part of a log could not be read."""
@@ -142,7 +142,7 @@ def replay(
     """
     from replay.options import ReplayOptions
     from replay.selection import Selection
-    from replay.viewer_protocol import ViewerOptions
+    from replay.viewing.protocol import ViewerOptions
 
     viewer = ViewerOptions(save, spawn, connect, serve, live=rate is not None)
     if no_viewer and (viewer != ViewerOptions(live=viewer.live) or map_every or detect_every):

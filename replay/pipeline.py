@@ -28,7 +28,7 @@ from replay.poses.laser_poses import FUSED, LaserPoses
 from replay.poses.localize import Localizer
 from replay.result import ReplayResult
 from replay.timing import RatePacer, StageTimer
-from replay.viewer_protocol import NullViewer, Scene, Viewer
+from replay.viewing.protocol import NullViewer, Scene, Viewer
 
 MAP_SNAPSHOTS = 50
 """By default the map is shown about this many times; set by hand."""

@@ -20,7 +20,9 @@ from prim.metrics import DetectionErrors
 from prim.scan import PosedScan
 from prim.world import World
 from replay.detection import DetectionResult
-from replay.drawing import (
+from replay.result import ReplayResult
+from replay.viewing.checks import check_display, check_viewer, create_partial, find_free_port, partial_path
+from replay.viewing.drawing import (
     confidence_ellipse,
     crop_sheet,
     occupancy_percent,
@@ -29,11 +31,9 @@ from replay.drawing import (
     subsample,
     uncertainty_bounds,
 )
-from replay.markdown import detections_markdown, summary_markdown
-from replay.result import ReplayResult
-from replay.scan_batch import ScanBatch, ScanEntry
-from replay.viewer_checks import check_display, check_viewer, create_partial, find_free_port, partial_path
-from replay.viewer_protocol import Scene, ViewerOptions
+from replay.viewing.markdown import detections_markdown, summary_markdown
+from replay.viewing.protocol import Scene, ViewerOptions
+from replay.viewing.scan_batch import ScanBatch, ScanEntry
 
 if TYPE_CHECKING:
     from detect.detection import Detection

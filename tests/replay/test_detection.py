@@ -25,7 +25,7 @@ from replay.pipeline import Pipeline
 from replay.report import report_json, summary_rows
 from replay.result import ReplayResult
 from replay.viewer import RerunViewer
-from replay.viewer_protocol import ViewerOptions
+from replay.viewing.protocol import ViewerOptions
 from tests.replay.test_viewer import rows_of, timed, value
 
 

@@ -22,7 +22,7 @@ from replay.pipeline import Pipeline
 from replay.result import ReplayResult
 from replay.selection import Selection
 from replay.viewer import RerunViewer
-from replay.viewer_protocol import ViewerOptions
+from replay.viewing.protocol import ViewerOptions
 
 RERUN = Path(sys.executable).with_name("rerun")
 SCREENSHOT = Path(__file__).parents[2] / "docs" / "screenshot.py"
