@@ -1,1 +1,1 @@
-"""Measurements that anyone can repeat: maps, speed, damaged logs."""
+"""Benchmarks and side-by-side measurements: maps, poses, detection, refinement, speed, damaged logs."""

@@ -45,17 +45,35 @@ Draw = Callable[[np.random.Generator], tuple[float, ...]]
 
 
 def uniform(sizes: int, low: float, high: float) -> Draw:
-    """So many sizes (m) drawn independently, each uniform from ``low`` to ``high``."""
+    """Make a draw of independent sizes from one uniform distribution.
+
+    Args:
+        sizes: how many.
+        low: smallest size (m).
+        high: largest size (m).
+
+    Returns:
+        The draw.
+    """
     return lambda rng: tuple(rng.uniform(low, high) for _ in range(sizes))
 
 
-def isosceles(low: float, high: float, least_height: float) -> Draw:
-    """Base and height (m) of an isosceles triangle: base and legs uniform, drawn again until it is high enough."""
+def isosceles(low: float, high: float, min_height: float) -> Draw:
+    """Make a draw of base and height of an isosceles triangle, whose base and legs are uniform.
+
+    Args:
+        low: shortest base or leg (m).
+        high: longest one (m).
+        min_height: both are drawn again until the triangle is this high (m).
+
+    Returns:
+        The draw.
+    """
 
     def draw(rng: np.random.Generator) -> tuple[float, float]:
         while True:
             base, leg = rng.uniform(low, high), rng.uniform(low, high)
-            if leg > base / 2 and (height := math.sqrt(leg**2 - base**2 / 4)) >= least_height:
+            if leg > base / 2 and (height := math.sqrt(leg**2 - base**2 / 4)) >= min_height:
                 return base, height
 
     return draw
@@ -357,14 +375,28 @@ class Primitive:
 
 
 def angle_difference(a: float, b: float, period: float = 2 * math.pi) -> float:
-    """A - b (rad) modulo ``period``, in [-period/2, period/2)."""
+    """Subtract angles modulo a period.
+
+    Args:
+        a: an angle (rad).
+        b: what is subtracted (rad).
+        period: the period (rad).
+
+    Returns:
+        a - b in [-period/2, period/2).
+    """
     return (a - b + period / 2) % period - period / 2
 
 
 def angle_error(estimate: Primitive, truth: Primitive) -> float | None:
-    """How far the estimate is turned from the truth (rad, >= 0), modulo the truth's own symmetry.
+    """Compute the error in angle modulo the true shape's own symmetry.
 
-    None where either has no angle.
+    Args:
+        estimate: the estimate.
+        truth: the true primitive.
+
+    Returns:
+        Radians, 0 or more; None where either has no angle.
     """
     if truth.symmetry is None or estimate.theta is None or truth.theta is None:
         return None

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from mapping.forward.mapper import estimate_noise
+from mapping.forward.mapper import estimate_range_noise
 from mapping.grid import GridFrame, OccupancyGrid
 from mapping.kernels import hit_extent, scan_arrays
 from mapping.mapper import Mapper, make_mapper
@@ -180,7 +180,7 @@ def make_replay_mapper(
         every = -(-len(posed_scans.scan_log) // NOISE_SCANS)
         pieces = [piece for posed in posed_scans if posed.position % every == 0 for piece in posed.pieces]
         with timer.stage("map"):
-            noise_std = estimate_noise(pieces, frame)
+            noise_std = estimate_range_noise(pieces, frame)
         if noise_std is None:
             what = "too few ranges to find the noise for the Gaussian sensor model"
             raise LogReadError(posed_scans.scan_log.path, what, "give it: --noise-std")

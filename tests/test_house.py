@@ -1,29 +1,108 @@
-"""The house's order: who may import whom, what is never loaded."""
+"""The order of the house: who may import whom, one name for one thing, numbers and kinds in one place each."""
+
+from __future__ import annotations
 
 import ast
+import re
+from collections import defaultdict
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
 ROOT = Path(__file__).parents[1]
 PARTS = ("prim", "mapping", "detect", "recorder", "replay")
-ALLOWED = {
-    "prim": {"prim"},
-    "mapping": {"prim", "mapping"},
-    "detect": {"prim", "mapping", "detect", "recorder"},
-    "recorder": {"prim", "recorder"},
-    "replay": {"prim", "mapping", "detect", "replay"},
+
+ARROWS: dict[str, set[str]] = {
+    "prim": set(),
+    "prim/log": {"prim"},
+    "recorder": {"prim", "prim/log"},
+    "mapping": {"prim", "mapping/forward"},
+    "mapping/forward": {"prim", "mapping"},
+    "detect/networks": {"prim", "mapping"},
+    "detect/refinement": {"prim", "mapping", "mapping/forward", "detect"},
+    "detect": {"prim", "mapping", "detect/networks"},
+    "detect/training": {
+        "prim", "prim/log", "recorder", "mapping", "mapping/forward", "detect", "detect/networks",
+    },
+    "detect/evaluation": {
+        "prim", "recorder", "mapping", "mapping/forward", "detect", "detect/networks", "detect/refinement",
+        "detect/training",
+    },
+    "replay/poses": {"prim", "prim/log", "mapping", "mapping/forward"},
+    "replay/viewing": {"prim", "mapping", "detect", "replay", "replay/poses"},
+    "replay": {
+        "prim", "prim/log", "mapping", "mapping/forward", "detect", "detect/networks", "detect/refinement",
+        "replay/poses", "replay/viewing",
+    },
+}  # fmt: skip
+"""For each folder the folders that its files may import from, beside itself."""
+
+NARROW = {
+    ("mapping", "mapping/forward"): {"mapper"},
+    ("detect", "detect/training"): {"cli"},
+    ("detect", "detect/evaluation"): {"cli"},
 }
+"""Arrows that only these files of a folder have."""
+
+ENDS = {
+    ("detect/refinement", "detect"): {"detection"},
+    ("replay/viewing", "replay"): {"result", "report", "detection", "evaluation", "notes"},
+}
+"""Arrows that lead to these files of a folder alone."""
+
 TRAINING = {"torch", "torchvision", "ultralytics"}
-MAY_TRAIN = ("detect/training", "detect/evaluation")
+MAY_TRAIN = ("detect/training/", "detect/evaluation/")
 
 SOURCES = sorted(path for part in PARTS for path in (ROOT / part).glob("**/*.py"))
 OUTSIDE = sorted(path for part in ("bench", "docs") for path in (ROOT / part).glob("*.py"))
 
+NAMES_KINDS = {
+    "prim/shapes.py": "the table itself",
+    "detect/evaluation/paper.py": "the paper's tables",
+    "detect/refinement/proposals.py": "proposes rectangles",
+    "detect/refinement/walls.py": "a stretch of a wall is a thin rectangle",
+}
+"""Files that name a kind, and why."""
 
-def imported(path: Path) -> set[str]:
+NUMBERS = {
+    "array layout": (
+        "COLUMNS BLOCK CHUNK SHIFT SPACING REACH TABLE_REACH TABLE_SPACING TABLE_MARGIN_CELLS PARAMETERS FIRST_ROOM "
+        "NEAREST MAX_RANGE COLLECTED_ROWS SCRATCH_ROWS BOX ROUND TRIANGLE POLYGON MEASURED TOO_NEAR NO_RETURN INVALID "
+        "CENSORED_MOMENTS HITS PASSES SQUARES_OF_ARRIVAL SKIPPED HIT FREE OCCUPIED UNSEEN MAX_CLEARANCE USED REJECTED "
+        "MIN_BLOCKS MAX_BLOCKS BLOCK_CELLS"
+    ),
+    "mathematics": "NORMAL_MAD NORMAL_MEDIAN EQUATORIAL_RADIUS FLATTENING OUTLINE_POINTS",
+    "rounding and the infinite": "FAR BEHIND ENDLESS EXACT POSITIVE NO_COUNTS TRANSMITTANCE_FLOOR BORDER_SLACK",
+    "definitions": "UNKNOWN_GREY WHITE_EVIDENCE TOLERANCE_CELLS MAX_CELLS",
+}
+"""The numeric constants that modules of algorithms may have beside their options."""
+
+WITHOUT_NUMBERS = ("mapping/", "detect/refinement/", "detect/tracker.py", "replay/poses/")
+
+
+def name_of(path: Path) -> str:
+    return path.relative_to(ROOT).as_posix()
+
+
+def tree_of(path: Path) -> ast.Module:
+    return ast.parse(path.read_text(encoding="utf-8"))
+
+
+def module_of(path: Path) -> str:
+    return name_of(path).removesuffix(".py").removesuffix("/__init__").replace("/", ".")
+
+
+MODULES = {module_of(path): path for path in SOURCES}
+
+
+def folder_of(module: str) -> str:
+    return name_of(MODULES[module].parent)
+
+
+def imported_packages(tree: ast.Module) -> set[str]:
     names = set()
-    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+    for node in ast.walk(tree):
         if isinstance(node, ast.Import):
             names |= {alias.name.split(".")[0] for alias in node.names}
         elif isinstance(node, ast.ImportFrom) and node.module:
@@ -31,27 +110,134 @@ def imported(path: Path) -> set[str]:
     return names
 
 
-@pytest.mark.parametrize("path", SOURCES, ids=lambda path: path.relative_to(ROOT).as_posix())
+def imported_modules(tree: ast.Module) -> set[str]:
+    """The modules of the house that one imports: when it is needed and for types alone, too."""
+    found = set()
+    for node in ast.walk(tree):
+        if isinstance(node, ast.ImportFrom) and node.module:
+            inner = {f"{node.module}.{alias.name}" for alias in node.names} & MODULES.keys()
+            found |= inner or {node.module} & MODULES.keys()
+        elif isinstance(node, ast.Import):
+            found |= {alias.name for alias in node.names} & MODULES.keys()
+    return found
+
+
+def public_functions(tree: ast.Module) -> Iterator[ast.FunctionDef]:
+    """Public functions, and public methods of public classes."""
+    for node in tree.body:
+        if isinstance(node, ast.FunctionDef) and not node.name.startswith("_"):
+            yield node
+        if isinstance(node, ast.ClassDef) and not node.name.startswith("_"):
+            for inner in node.body:
+                if isinstance(inner, ast.FunctionDef) and not inner.name.startswith("_"):
+                    yield inner
+
+
+def assigned_names(node: ast.stmt) -> list[str]:
+    targets = (
+        node.targets if isinstance(node, ast.Assign) else [node.target] if isinstance(node, ast.AnnAssign) else []
+    )
+    return [part.id for target in targets for part in ast.walk(target) if isinstance(part, ast.Name)]
+
+
+def is_numeric(value: ast.expr | None) -> bool:
+    literals = (ast.Constant, ast.UnaryOp, ast.BinOp, ast.operator, ast.unaryop, ast.Tuple, ast.Load)
+    parts = list(ast.walk(value)) if value is not None else []
+    numbers = [part for part in parts if isinstance(part, ast.Constant) and isinstance(part.value, int | float)]
+    return bool(numbers) and all(isinstance(part, literals) for part in parts)
+
+
+every_source = pytest.mark.parametrize("path", SOURCES, ids=name_of)
+
+
+@every_source
 def test_imports_run_along_the_arrows(path: Path) -> None:
-    name = path.relative_to(ROOT).as_posix()
-    names = imported(path)
-    assert names & set(PARTS) <= ALLOWED[name.split("/")[0]]
-    assert "rerun" not in names or name == "replay/viewer.py"
-    assert not names & TRAINING or name.startswith(MAY_TRAIN)
+    folder = name_of(path.parent)
+    for module in imported_modules(tree_of(path)):
+        target = folder_of(module)
+        if path == ROOT / "prim" / "__init__.py" or target == folder:
+            continue
+        arrow = folder, target
+        allowed = ARROWS[folder] | {
+            end for (start, end), files in NARROW.items() if start == folder and path.stem in files
+        }
+        assert target in allowed, f"{folder} imports {module}"
+        assert arrow not in NARROW or path.stem in NARROW[arrow], f"{path.stem} imports {module}"
+        assert arrow not in ENDS or module.split(".")[-1] in ENDS[arrow], f"{folder} imports {module}"
 
 
-@pytest.mark.parametrize("path", SOURCES, ids=lambda path: path.relative_to(ROOT).as_posix())
+@every_source
+def test_heavy_packages_stay_where_they_belong(path: Path) -> None:
+    names = imported_packages(tree_of(path))
+    assert "rerun" not in names or name_of(path) == "replay/viewer.py"
+    assert not names & TRAINING or name_of(path).startswith(MAY_TRAIN)
+
+
+def test_no_module_imports_itself_by_way_of_others() -> None:
+    imports = {module: imported_modules(tree_of(path)) - {module} for module, path in MODULES.items()}
+    while leaves := [module for module, needed in imports.items() if not needed & imports.keys()]:
+        for module in leaves:
+            del imports[module]
+    assert not imports, f"cycles among {sorted(imports)}"
+
+
+def test_no_two_modules_define_public_classes_of_one_name() -> None:
+    places = defaultdict(list)
+    for module, path in MODULES.items():
+        for node in tree_of(path).body:
+            if isinstance(node, ast.ClassDef) and not node.name.startswith("_"):
+                places[node.name].append(module)
+    assert not {name: where for name, where in places.items() if len(where) > 1}
+
+
+@every_source
 def test_library_code_neither_prints_nor_exits(path: Path) -> None:
     if path.name in ("cli.py", "console.py"):
         return
-    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+    for node in ast.walk(tree_of(path)):
         if isinstance(node, ast.Call):
             assert ast.unparse(node.func) not in ("print", "sys.exit", "exit", "typer.echo")
 
 
-@pytest.mark.parametrize("path", OUTSIDE, ids=lambda path: path.relative_to(ROOT).as_posix())
+@every_source
+def test_docstrings_have_sections(path: Path) -> None:
+    """Of functions with two parameters and more; but commands', which are help texts, and those that say «See»."""
+    for function in public_functions(tree_of(path)):
+        given = function.args
+        names = [argument.arg for argument in (*given.posonlyargs, *given.args, *given.kwonlyargs)]
+        decorators = [ast.unparse(decorator) for decorator in function.decorator_list]
+        text = ast.get_docstring(function) or ""
+        if text.startswith("See ") or any(".command(" in one or ".setter" in one for one in decorators):
+            continue
+        parameters = [name for name in names if name not in ("self", "cls")]
+        where = f"{name_of(path)}:{function.lineno} {function.name}"
+        if len(parameters) >= 2:
+            assert "Args:" in text, where
+        returned = ast.unparse(function.returns) if function.returns else "None"
+        if "Args:" in text and returned not in ("None", "NoReturn"):
+            assert "Returns:" in text or "Yields:" in text, where
+
+
+@every_source
+def test_numbers_stand_in_options(path: Path) -> None:
+    if not name_of(path).startswith(WITHOUT_NUMBERS):
+        return
+    allowed = {name for names in NUMBERS.values() for name in names.split()}
+    for node in tree_of(path).body:
+        if isinstance(node, ast.Assign | ast.AnnAssign) and is_numeric(node.value):
+            assert set(assigned_names(node)) <= allowed, f"{name_of(path)}:{node.lineno} {ast.unparse(node)}"
+
+
+@every_source
+def test_kinds_are_known_by_their_rows(path: Path) -> None:
+    if name_of(path) not in NAMES_KINDS:
+        named = re.findall(r"Kind\.(?:SQUARE|RECTANGLE|CIRCLE|TRIANGLE|ELLIPSE)", path.read_text(encoding="utf-8"))
+        assert not named
+
+
+@pytest.mark.parametrize("path", OUTSIDE, ids=name_of)
 def test_benches_and_docs_use_public_names_only(path: Path) -> None:
-    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+    for node in ast.walk(tree_of(path)):
         if isinstance(node, ast.Attribute) and node.attr.startswith("_") and not node.attr.startswith("__"):
             assert ast.unparse(node.value) in ("self", "cls"), ast.unparse(node)
         if isinstance(node, ast.ImportFrom):

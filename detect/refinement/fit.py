@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from detect.refinement.geometry import NUMBERS, OUTLINES, TIES, parameters_of
-from detect.refinement.kernels import PARAMETERS, Schedule, descend, negative_log_likelihoods
+from detect.refinement.kernels import PARAMETERS, Schedule, Starts, descend, negative_log_likelihoods
 from detect.refinement.options import DEFAULTS, Descent, FitOptions
 from detect.refinement.rays import RayBundle
 from detect.refinement.sensor_model import BeamModel
@@ -298,7 +298,8 @@ def _fit_each(
     information = np.zeros_like(ties)
     numbers = np.array([NUMBERS[kind] for kind, _ in begin])
     schedule = _schedule(descent, subset.stride, sensor, options)
-    descend(OUTLINES, numbers, shapes, ties, sizes, sensor.data(subset.bundle), schedule, cost, information)
+    batch = Starts(numbers, shapes, ties, sizes)
+    descend(OUTLINES, batch, sensor.data(subset.bundle), schedule, cost, information)
     cost, information = subset.stride * cost, subset.stride * information
     return [
         KindFit(kind, p, float(nats), known[:size, :size])

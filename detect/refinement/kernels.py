@@ -118,6 +118,27 @@ class RayStoreView(NamedTuple):
     scan: NDArray[np.int32]
 
 
+class Intersections(NamedTuple):
+    """Where the rays of a block meet a shape: ``ranges`` and ``clearances`` (BLOCK,), ``scratch`` for polygons."""
+
+    ranges: FloatArray
+    clearances: FloatArray
+    scratch: FloatArray
+
+
+class Starts(NamedTuple):
+    """The starts of M fits.
+
+    The kinds' ``numbers`` (M,); ``shapes`` (M, 5), parameters that a fit changes in place; ``ties`` (M, 5, 5), the
+    matrices from the kinds' own parameters to the five; ``sizes`` (M,), how many own parameters there are.
+    """
+
+    numbers: NDArray[np.int64]
+    shapes: FloatArray
+    ties: FloatArray
+    sizes: NDArray[np.int64]
+
+
 class Schedule(NamedTuple):
     """How Levenberg and Marquardt's method descends.
 
@@ -169,7 +190,7 @@ def likelihood_table(outlier: float) -> FloatArray:
 
 
 @part
-def lookup(table: Any, row: int, x: float) -> float:
+def _lookup(table: Any, row: int, x: float) -> float:
     """Interpolate a row of the table linearly at x."""
     place = (min(max(x, -TABLE_REACH), TABLE_REACH) + TABLE_REACH) * TABLE_SPACING
     entry = min(int(place), 2 * int(TABLE_REACH) * TABLE_SPACING - 1)
@@ -178,7 +199,7 @@ def lookup(table: Any, row: int, x: float) -> float:
 
 
 @part
-def enter_form(form: int, lx: float, ly: float, ux: float, uy: float) -> tuple[float, float, float]:
+def _enter_form(form: int, lx: float, ly: float, ux: float, uy: float) -> tuple[float, float, float]:
     """Intersect the line l + t u with the unit outline of a form.
 
     Returns:
@@ -226,8 +247,8 @@ def enter_form(form: int, lx: float, ly: float, ux: float, uy: float) -> tuple[f
 
 
 @part
-def enter_polygon(outline: Any, lx: float, ly: float, ux: float, uy: float) -> tuple[float, float, float]:
-    """As :func:`enter_form`, of a polygon: ``outline`` is the outlines and the kind's number."""
+def _enter_polygon(outline: Any, lx: float, ly: float, ux: float, uy: float) -> tuple[float, float, float]:
+    """As :func:`_enter_form`, of a polygon: ``outline`` is the outlines and the kind's number."""
     outlines, k = outline
     t, nx, ny, leave = -FAR, 0.0, 0.0, FAR
     for edge in range(outlines.corners[k]):
@@ -248,7 +269,7 @@ def enter_polygon(outline: Any, lx: float, ly: float, ux: float, uy: float) -> t
 
 
 @part
-def form_support(form: int, mx: float, my: float) -> tuple[float, float]:
+def _form_support(form: int, mx: float, my: float) -> tuple[float, float]:
     """Return the point of a form's unit outline that is farthest along (mx, my)."""
     if form == ROUND:
         length = math.sqrt(mx * mx + my * my)
@@ -262,8 +283,8 @@ def form_support(form: int, mx: float, my: float) -> tuple[float, float]:
 
 
 @part
-def polygon_support(outline: Any, mx: float, my: float) -> tuple[float, float]:
-    """As :func:`form_support`, of a polygon."""
+def _polygon_support(outline: Any, mx: float, my: float) -> tuple[float, float]:
+    """As :func:`_form_support`, of a polygon."""
     outlines, k = outline
     farthest, reach = 0, -FAR
     for corner in range(outlines.corners[k]):
@@ -274,7 +295,7 @@ def polygon_support(outline: Any, mx: float, my: float) -> tuple[float, float]:
 
 
 @part
-def silhouette_range_gradient(
+def _silhouette_range_gradient(
     sign: float, ax: float, ay: float, bx: float, by: float, width: float, height: float, dr: Any
 ) -> None:
     """Set the derivatives of the range to an ellipse's silhouette point, which slides along the outline.
@@ -290,13 +311,13 @@ def silhouette_range_gradient(
 
 
 @part
-def form_is_round(form: int) -> bool:
+def _form_is_round(form: int) -> bool:
     """Return whether a form is the disc."""
     return form == ROUND
 
 
 @part
-def polygon_is_round(outline: Any) -> bool:
+def _polygon_is_round(outline: Any) -> bool:
     """No polygon is round."""
     return False
 
@@ -365,7 +386,7 @@ def _intersection(support: Any, enter: Any, is_round: Any) -> Any:
             dr[THETA] = dy * px - dx * py
             dr[WIDTH], dr[HEIGHT] = bx * qx, by * qy
             if is_round(outline):
-                silhouette_range_gradient(sign, ax, ay, bx, by, width, height, dr)
+                _silhouette_range_gradient(sign, ax, ay, bx, by, width, height, dr)
             return (px - ox) * dx + (py - oy) * dy, s
         hx, hy = lx + t * ux, ly + t * uy
         scale = 1.0 / (gx * ux + gy * uy)
@@ -378,17 +399,26 @@ def _intersection(support: Any, enter: Any, is_round: Any) -> Any:
     return part(intersect_with_gradient)
 
 
-form_with_gradient = _intersection(form_support, enter_form, form_is_round)
-polygon_with_gradient = _intersection(polygon_support, enter_polygon, polygon_is_round)
+_form_with_gradient = _intersection(_form_support, _enter_form, _form_is_round)
+_polygon_with_gradient = _intersection(_polygon_support, _enter_polygon, _polygon_is_round)
 
 
 @part
-def intersect_form(form: int, p: Any, rays: Any, first: int, count: int, ranges: Any, clearances: Any) -> None:
-    """Intersect ``count`` <= BLOCK rays from the ``first`` on with a shape of a form, without derivatives.
+def _intersect_form(form: int, p: Any, rays: Any, block: Any, met: Any) -> None:
+    """Intersect a block of rays with a shape of a form, without derivatives.
 
     The clearance is -FAR where the shape lies behind a ray. Loops over rays have no branches, so that compilers can
     vectorise them.
+
+    Args:
+        form: BOX, ROUND or TRIANGLE.
+        p: (5,) parameters.
+        rays: (7, N).
+        block: the first ray, and how many (at most BLOCK).
+        met: the :class:`Intersections`, of which ranges and clearances are set.
     """
+    first, count = block
+    ranges, clearances, _ = met
     cos, sin = math.cos(p[THETA]), math.sin(p[THETA])
     x, y, width, height = p[X], p[Y], p[WIDTH], p[HEIGHT]
     to_x, to_y = 1.0 / width, 1.0 / height
@@ -442,7 +472,7 @@ def intersect_form(form: int, p: Any, rays: Any, first: int, count: int, ranges:
 
 
 @part
-def to_outline(p: Any, rays: Any, i: int, cos: float, sin: float) -> tuple[float, float, float, float, float, float]:
+def _to_outline(p: Any, rays: Any, i: int, cos: float, sin: float) -> tuple[float, float, float, float, float, float]:
     """Return a ray in the unit outline's frame (origin, direction), and its direction in the shape's own frame."""
     dx, dy = rays[DIRECTION_X, i], rays[DIRECTION_Y, i]
     ox, oy = rays[ORIGIN_X, i] - p[X], rays[ORIGIN_Y, i] - p[Y]
@@ -452,18 +482,18 @@ def to_outline(p: Any, rays: Any, i: int, cos: float, sin: float) -> tuple[float
 
 
 @part
-def intersect_polygon(
-    outlines: Any, k: int, p: Any, rays: Any, first: int, count: int, ranges: Any, clearances: Any, scratch: Any
-) -> None:
-    """As :func:`intersect_form`, for a convex polygon: edge by edge, and vertex by vertex, over all rays.
+def _intersect_polygon(outlines: Any, k: int, p: Any, rays: Any, block: Any, met: Any) -> None:
+    """As :func:`_intersect_form`, for a convex polygon: edge by edge, and vertex by vertex, over all rays.
 
     A line misses a polygon exactly if all vertices lie on one side of it; it enters at the last of the crossings with
     edges that face it, and leaves at the first of the others (Cyrus and Beck 1978).
     """
+    first, count = block
+    ranges, clearances, scratch = met
     cos, sin = math.cos(p[THETA]), math.sin(p[THETA])
     width, height = p[WIDTH], p[HEIGHT]
     for i in range(count):
-        lx, ly, ux, uy, bx, by = to_outline(p, rays, first + i, cos, sin)
+        lx, ly, ux, uy, bx, by = _to_outline(p, rays, first + i, cos, sin)
         scratch[LX, i], scratch[LY, i], scratch[UX, i], scratch[UY, i] = lx, ly, ux, uy
         scratch[MX, i], scratch[MY, i], scratch[BX, i], scratch[BY, i] = (
             -width * by,
@@ -503,18 +533,16 @@ def intersect_polygon(
 
 
 @part
-def intersect(
-    outlines: Any, k: int, p: Any, rays: Any, first: int, count: int, ranges: Any, clearances: Any, scratch: Any
-) -> None:
-    """Intersect a block of rays with a shape of kind ``k``."""
+def _intersect(outlines: Any, k: int, p: Any, rays: Any, block: Any, met: Any) -> None:
+    """Intersect a block of rays with a shape of kind ``k``: as :func:`_intersect_form`, whatever its outline."""
     if outlines.form[k] == POLYGON:
-        intersect_polygon(outlines, k, p, rays, first, count, ranges, clearances, scratch)
+        _intersect_polygon(outlines, k, p, rays, block, met)
     else:
-        intersect_form(outlines.form[k], p, rays, first, count, ranges, clearances)
+        _intersect_form(outlines.form[k], p, rays, block, met)
 
 
 @part
-def range_gradients(form: int, p: Any, rays: Any, count: int, dr: Any) -> None:
+def _range_gradients(form: int, p: Any, rays: Any, count: int, dr: Any) -> None:
     """Set the derivatives ``dr`` (5, count) by p of the ranges to a shape that all ``rays`` (4, count) hit.
 
     As the outline moves along its normal, so does the point where a ray enters it, along the ray.
@@ -557,12 +585,12 @@ def range_gradients(form: int, p: Any, rays: Any, count: int, dr: Any) -> None:
 
 
 @part
-def polygon_range_gradients(outlines: Any, k: int, p: Any, rays: Any, count: int, dr: Any, scratch: Any) -> None:
-    """As :func:`range_gradients`, for a convex polygon."""
+def _polygon_range_gradients(outlines: Any, k: int, p: Any, rays: Any, count: int, dr: Any, scratch: Any) -> None:
+    """As :func:`_range_gradients`, for a convex polygon."""
     cos, sin = math.cos(p[THETA]), math.sin(p[THETA])
     width, height = p[WIDTH], p[HEIGHT]
     for i in range(count):
-        lx, ly, ux, uy, _, _ = to_outline(p, rays, i, cos, sin)
+        lx, ly, ux, uy, _, _ = _to_outline(p, rays, i, cos, sin)
         scratch[LX, i], scratch[LY, i], scratch[UX, i], scratch[UY, i] = lx, ly, ux, uy
         scratch[ENTER, i], scratch[NX, i], scratch[NY, i] = -FAR, 0.0, 0.0
     for edge in range(outlines.corners[k]):
@@ -585,7 +613,7 @@ def polygon_range_gradients(outlines: Any, k: int, p: Any, rays: Any, count: int
 
 
 @part
-def hit_fraction(s: float, blur: float) -> float:
+def _hit_fraction(s: float, blur: float) -> float:
     """Return the share of a ray's footprint that hits at clearance s: a cubic step from 0 at -blur to 1 at blur."""
     if s >= blur:
         return 1.0
@@ -642,7 +670,7 @@ def occlude(outlines: Any, k: int, p: Any, reach: float, rays: Any) -> None:
             away_x, away_y = p[X] - rays[ORIGIN_X, i], p[Y] - rays[ORIGIN_Y, i]
             passes |= abs(away_x * rays[DIRECTION_Y, i] - away_y * rays[DIRECTION_X, i]) < reach
         if passes:
-            intersect(outlines, k, p, rays, first, count, ranges, clearances, scratch)
+            _intersect(outlines, k, p, rays, (first, count), Intersections(ranges, clearances, scratch))
             for i in range(count):
                 if clearances[i] > 0 and ranges[i] < rays[OCCLUSION, first + i]:
                     rays[OCCLUSION, first + i] = max(ranges[i], 0.0)
@@ -660,7 +688,7 @@ def apply_occlusion(data: Any, background: Any, blocked: Any) -> None:
     rays, outcomes, sigma, table = data
     for i in range(len(outcomes)):
         if rays[OCCLUSION, i] < background[i]:
-            rays[BACKGROUND, i] = lookup(table, outcomes[i], (rays[OCCLUSION, i] - rays[RANGE, i]) / sigma)
+            rays[BACKGROUND, i] = _lookup(table, outcomes[i], (rays[OCCLUSION, i] - rays[RANGE, i]) / sigma)
         if blocked[i]:
             rays[OCCLUSION, i] = 0.0
 
@@ -671,7 +699,7 @@ def silhouette_clearances(outlines: Any, k: int, p: Any, rays: Any, out: Any) ->
     ranges, scratch = np.empty(BLOCK), np.empty((SCRATCH_ROWS, BLOCK))
     for first in range(0, len(out), BLOCK):
         count = min(BLOCK, len(out) - first)
-        intersect(outlines, k, p, rays, first, count, ranges, out[first:], scratch)
+        _intersect(outlines, k, p, rays, (first, count), Intersections(ranges, out[first:], scratch))
 
 
 @kernel
@@ -680,7 +708,7 @@ def cast_rays(outlines: Any, k: int, p: Any, rays: Any, out: Any) -> None:
     clearances, scratch = np.empty(BLOCK), np.empty((SCRATCH_ROWS, BLOCK))
     for first in range(0, len(out), BLOCK):
         count = min(BLOCK, len(out) - first)
-        intersect(outlines, k, p, rays, first, count, out[first:], clearances, scratch)
+        _intersect(outlines, k, p, rays, (first, count), Intersections(out[first:], clearances, scratch))
         for i in range(count):
             out[first + i] = max(out[first + i], 0.0) if clearances[i] > 0 else FAR
 
@@ -697,9 +725,9 @@ def standardized_clearances(outlines: Any, k: int, p: Any, covariance: Any, rays
     dr, ds = np.zeros(PARAMETERS), np.zeros(PARAMETERS)
     for i in range(len(out)):
         if form == POLYGON:
-            r, s = polygon_with_gradient((outlines, k), p, heading, rays, i, FAR, (dr, ds))
+            r, s = _polygon_with_gradient((outlines, k), p, heading, rays, i, FAR, (dr, ds))
         else:
-            r, s = form_with_gradient(form, p, heading, rays, i, FAR, (dr, ds))
+            r, s = _form_with_gradient(form, p, heading, rays, i, FAR, (dr, ds))
         if r >= rays[OCCLUSION, i] or s == -FAR:
             out[i] = -FAR
             continue
@@ -712,12 +740,12 @@ def standardized_clearances(outlines: Any, k: int, p: Any, covariance: Any, rays
 
 
 @part
-def partition(
+def _partition(
     rays: Any, first: int, ranges: Any, clearances: Any, blur: float, hits: Any, edges: Any, count: int
 ) -> Any:
     """Find which rays of a block hit a shape with all of their footprint, and which with a part of it.
 
-    ``ranges`` and ``clearances`` are as :func:`intersect` leaves them; ``hits`` and ``edges`` get the indices.
+    ``ranges`` and ``clearances`` are as :func:`_intersect` leaves them; ``hits`` and ``edges`` get the indices.
     Returns how many hit, how many do in part, and the background's log-likelihood of all others.
     """
     occlusions, backgrounds = rays[OCCLUSION, first : first + count], rays[BACKGROUND, first : first + count]
@@ -755,17 +783,18 @@ def negative_log_likelihoods(outlines: Any, numbers: Any, samples: Any, data: An
     for first in range(0, len(outcomes), BLOCK):
         count = min(BLOCK, len(outcomes) - first)
         for k in range(len(samples)):
-            intersect(outlines, numbers[k], samples[k], rays, first, count, ranges, clearances, scratch)
-            hit, edge, total = partition(rays, first, ranges, clearances, blur, hits, edges, count)
+            met = Intersections(ranges, clearances, scratch)
+            _intersect(outlines, numbers[k], samples[k], rays, (first, count), met)
+            hit, edge, total = _partition(rays, first, ranges, clearances, blur, hits, edges, count)
             for n in range(hit):
                 i = hits[n]
                 x = (max(ranges[i], 0.0) - rays[RANGE, first + i]) / sigma
-                total += lookup(table, outcomes[first + i], x)
+                total += _lookup(table, outcomes[first + i], x)
             for n in range(edge):
                 i = edges[n]
                 x = (max(ranges[i], 0.0) - rays[RANGE, first + i]) / sigma
-                share = hit_fraction(clearances[i], blur)
-                hit_chance = math.exp(lookup(table, outcomes[first + i], x))
+                share = _hit_fraction(clearances[i], blur)
+                hit_chance = math.exp(_lookup(table, outcomes[first + i], x))
                 total += math.log(share * hit_chance + (1.0 - share) * math.exp(rays[BACKGROUND, first + i]))
             out[k] -= total
 
@@ -802,39 +831,39 @@ def _gradient(  # noqa: C901 - one pass over the rays
     total = 0.0
     for first in range(0, len(outcomes), BLOCK):
         count = min(BLOCK, len(outcomes) - first)
-        intersect(outlines, k, p, rays, first, count, ranges, clearances, scratch)
-        hit, edge, missed = partition(rays, first, ranges, clearances, blur, hits, edges, count)
+        _intersect(outlines, k, p, rays, (first, count), Intersections(ranges, clearances, scratch))
+        hit, edge, missed = _partition(rays, first, ranges, clearances, blur, hits, edges, count)
         total += missed
         for n in range(hit):
             i = first + hits[n]
             x = (max(ranges[hits[n]], 0.0) - rays[RANGE, i]) / sigma
-            total += lookup(table, outcomes[i], x)
-            slope[n] = lookup(table, 3 + outcomes[i], x) / sigma
-            curvature[n] = range_information(outcomes[i], slope[n], x, sigma)
+            total += _lookup(table, outcomes[i], x)
+            slope[n] = _lookup(table, 3 + outcomes[i], x) / sigma
+            curvature[n] = _range_information(outcomes[i], slope[n], x, sigma)
             for row in range(RANGE):
                 hitting[row, n] = rays[row, i]
         if form == POLYGON:
-            polygon_range_gradients(outlines, k, p, hitting, hit, dr, scratch)
+            _polygon_range_gradients(outlines, k, p, hitting, hit, dr, scratch)
         else:
-            range_gradients(form, p, hitting, hit, dr)
+            _range_gradients(form, p, hitting, hit, dr)
         for a in range(PARAMETERS):
-            gradient[a] -= weighted_sum(slope, dr[a], dr[a], hit, False)
+            gradient[a] -= _weighted_sum(slope, dr[a], dr[a], hit, False)
             for b in range(a + 1):
-                information[a, b] += weighted_sum(curvature, dr[a], dr[b], hit, True)
+                information[a, b] += _weighted_sum(curvature, dr[a], dr[b], hit, True)
         for n in range(edge):
             i = first + edges[n]
             if form == POLYGON:
-                at, aside = polygon_with_gradient((outlines, k), p, heading, rays, i, blur, (moved, slid))
+                at, aside = _polygon_with_gradient((outlines, k), p, heading, rays, i, blur, (moved, slid))
             else:
-                at, aside = form_with_gradient(form, p, heading, rays, i, blur, (moved, slid))
+                at, aside = _form_with_gradient(form, p, heading, rays, i, blur, (moved, slid))
             x = (max(at, 0.0) - rays[RANGE, i]) / sigma
-            share = hit_fraction(aside, blur)
-            hit_chance, miss_chance = math.exp(lookup(table, outcomes[i], x)), math.exp(rays[BACKGROUND, i])
+            share = _hit_fraction(aside, blur)
+            hit_chance, miss_chance = math.exp(_lookup(table, outcomes[i], x)), math.exp(rays[BACKGROUND, i])
             likelihood = share * hit_chance + (1.0 - share) * miss_chance
             total += math.log(likelihood)
             responsibility = share * hit_chance / likelihood
-            downhill = lookup(table, 3 + outcomes[i], x) / sigma
-            known = responsibility * range_information(outcomes[i], downhill, x, sigma)
+            downhill = _lookup(table, 3 + outcomes[i], x) / sigma
+            known = responsibility * _range_information(outcomes[i], downhill, x, sigma)
             u = 0.5 * (aside / blur + 1.0)
             step = (hit_chance - miss_chance) / likelihood * 3.0 * u * (1.0 - u) / blur
             for a in range(PARAMETERS):
@@ -848,12 +877,12 @@ def _gradient(  # noqa: C901 - one pass over the rays
     return -total
 
 
-gradient_part, gradient = part(_gradient), kernel(_gradient)
+_gradient_part, gradient = part(_gradient), kernel(_gradient)
 """The same, for kernels to be made of, and as a kernel."""
 
 
 @part
-def weighted_sum(weight: Any, first: Any, second: Any, count: int, both: bool) -> float:
+def _weighted_sum(weight: Any, first: Any, second: Any, count: int, both: bool) -> float:
     """Return the sum of ``weight`` times ``first``, and times ``second`` where ``both`` count."""
     total = 0.0
     for n in range(count):
@@ -862,7 +891,7 @@ def weighted_sum(weight: Any, first: Any, second: Any, count: int, both: bool) -
 
 
 @part
-def range_information(outcome: int, slope: float, x: float, sigma: float) -> float:
+def _range_information(outcome: int, slope: float, x: float, sigma: float) -> float:
     """Return the information (1 / m²) of a ray that hits on its range; ``slope`` is its log-likelihood's derivative.
 
     Of a measured range the slope is -x times the share that is no outlier: what is left of it over x.
@@ -873,7 +902,7 @@ def range_information(outcome: int, slope: float, x: float, sigma: float) -> flo
 
 
 @part
-def solve_damped(matrix: Any, vector: Any, damping: float, out: Any, lower: Any, size: int) -> bool:
+def _solve_damped(matrix: Any, vector: Any, damping: float, out: Any, lower: Any, size: int) -> bool:
     """Solve (matrix + damping diag(matrix)) out = vector by Cholesky; False where not positive definite."""
     for a in range(size):
         for b in range(a + 1):
@@ -902,7 +931,7 @@ def solve_damped(matrix: Any, vector: Any, damping: float, out: Any, lower: Any,
 
 
 @part
-def project(tie: Any, size: int, gradient: Any, full: Any, downhill: Any, information: Any) -> None:
+def _project(tie: Any, size: int, gradient: Any, full: Any, downhill: Any, information: Any) -> None:
     """Set a kind's own downhill direction (K,) and information (K, K) from those of the five parameters."""
     for k in range(size):
         downhill[k] = 0.0
@@ -916,7 +945,7 @@ def project(tie: Any, size: int, gradient: Any, full: Any, downhill: Any, inform
 
 
 @part
-def step(p: Any, tie: Any, size: int, change: Any, schedule: Any, trial: Any) -> None:
+def _step(p: Any, tie: Any, size: int, change: Any, schedule: Any, trial: Any) -> None:
     """Set the parameters after a change (K,) of a kind's own; a size is no more than halved or doubled."""
     for a in range(PARAMETERS):
         trial[a] = p[a]
@@ -927,36 +956,24 @@ def step(p: Any, tie: Any, size: int, change: Any, schedule: Any, trial: Any) ->
 
 
 @kernel
-def descend(
-    outlines: Any,
-    numbers: Any,
-    shapes: Any,
-    ties: Any,
-    sizes: Any,
-    data: Any,
-    schedule: Any,
-    cost: Any,
-    information: Any,
-) -> None:
+def descend(outlines: Any, starts: Any, data: Any, schedule: Any, cost: Any, information: Any) -> None:
     """Minimise the negative log-likelihood from each of some shapes by Levenberg and Marquardt's method.
 
     Args:
         outlines: the kinds' outlines.
-        numbers: (M,) the kinds' numbers.
-        shapes: (M, 5) parameters, changed in place.
-        ties: (M, 5, 5) the matrices from the kinds' own parameters to the five.
-        sizes: (M,) how many own parameters there are.
+        starts: the :class:`Starts`; their shapes are changed in place.
         data: the :class:`RayData`.
         schedule: the :class:`Schedule`.
         cost: (M,) gets the costs (nats) at the last blur.
         information: (M, 5, 5) gets the information on own parameters.
     """
+    numbers, shapes, ties, sizes = starts
     for k in range(len(shapes)):
-        cost[k] = descend_one(outlines, numbers[k], shapes[k], ties[k], sizes[k], data, schedule, information[k])
+        cost[k] = _descend_one(outlines, numbers[k], shapes[k], ties[k], sizes[k], data, schedule, information[k])
 
 
 @part
-def descend_one(
+def _descend_one(
     outlines: Any, number: int, p: Any, tie: Any, size: int, data: Any, schedule: Any, information: Any
 ) -> float:
     """As :func:`descend`, of one shape; returns its cost (nats)."""
@@ -970,7 +987,7 @@ def descend_one(
         cost, damping = math.inf, schedule.first_damping
         trial[:] = p
         for count in range(schedule.iterations + 1):
-            found = gradient_part(outlines, number, trial, data, blur, other_gradient, other_full)
+            found = _gradient_part(outlines, number, trial, data, blur, other_gradient, other_full)
             if found < cost:
                 gained = cost - found
                 cost = found
@@ -982,15 +999,15 @@ def descend_one(
                     break
             else:
                 damping *= 8
-            project(tie, size, gradient, full, downhill, information)
-            while damping < schedule.max_damping and not solve_damped(
+            _project(tie, size, gradient, full, downhill, information)
+            while damping < schedule.max_damping and not _solve_damped(
                 information, downhill, damping, change, lower, size
             ):
                 damping = max(10 * damping, 1e-3)
             if damping > schedule.max_damping:
                 break
-            step(p, tie, size, change, schedule, trial)
+            _step(p, tie, size, change, schedule, trial)
     if blurs[-1] < schedule.information_blur:
-        gradient_part(outlines, number, p, data, schedule.information_blur, gradient, full)
-    project(tie, size, gradient, full, downhill, information)
+        _gradient_part(outlines, number, p, data, schedule.information_blur, gradient, full)
+    _project(tie, size, gradient, full, downhill, information)
     return cost

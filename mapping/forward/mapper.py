@@ -429,7 +429,7 @@ def _geometric_mean(old: RangeNoise, new: RangeNoise) -> RangeNoise:
     return RangeNoise(math.sqrt(old.std * new.std), math.sqrt(old.outlier_share * new.outlier_share))
 
 
-def estimate_noise(
+def estimate_range_noise(
     scans: Iterable[tuple[Scan, Pose2D]], frame: GridFrame, options: ForwardOptions = DEFAULTS
 ) -> float | None:
     """Estimate the range noise alone; large maps are made of larger cells.

@@ -123,7 +123,7 @@ class ForwardOptions:
     # While scans stream in: stepwise expectation-maximisation.
 
     streaming_cells: int = 120_000
-    """The streaming map's cells are twice as large as the map's, or larger where it would have more cells than this."""
+    """The streaming map's cells are twice as large as the map's; larger where it would have more cells than this."""
 
     revisited_rays: int = 256
     """Number of earlier rays that each scan's step takes again."""

@@ -17,7 +17,7 @@ from hypothesis import strategies as st
 from bench.sessions import Session, recorded
 from mapping.forward.calibration import is_known
 from mapping.forward.level import ALL_RAYS, Fold, Level, RangeNoise, RayStore, RaySubset, smoothing_width
-from mapping.forward.mapper import ForwardMapper, coarsened, estimate_noise, level_factors
+from mapping.forward.mapper import ForwardMapper, coarsened, estimate_range_noise, level_factors
 from mapping.forward.options import ForwardOptions
 from mapping.forward.sieve import gaussian_kernel
 from mapping.grid import GridFrame
@@ -256,7 +256,7 @@ def test_censored_ranges_are_needed_for_the_noise(noisiest: Session) -> None:
         (replace(scan, ranges=np.where(np.isneginf(scan.ranges), np.float32(np.nan), scan.ranges)), pose)
         for scan, pose in noisiest.scans
     ]
-    assert estimate_noise(dropped, noisiest.frame) < 0.47
+    assert estimate_range_noise(dropped, noisiest.frame) < 0.47
 
 
 def test_the_streaming_map_improves_and_the_final_map_does_not_depend_on_it(noisiest: Session) -> None:
