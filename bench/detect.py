@@ -2,9 +2,9 @@
 
     python -m bench.detect --weights WEIGHTS [--mapper forward] [--yolo W.pt] [--update docs/detect.md]
 
-Accuracy: maps of recorded sessions, 2 x 2 m with cells of 10 mm, seeds from 40000; the baseline is bench/classical.py.
-Speed: all are timed in turns within one run; ``--yolo`` adds YOLO's weights run by ultralytics. Needs the extra
-[train].
+Accuracy: maps of recorded sessions, 2 x 2 m with cells of 10 mm, seeds from 40000; the baseline is
+bench/classical.py. Speed: all are timed in turns within one run; ``--yolo`` adds YOLO's weights run by ultralytics.
+Needs the extra [train].
 """
 
 from __future__ import annotations

@@ -3,9 +3,9 @@
     python -m bench.fuzz [--cuts 200] [--bytes 2000] [--seed 0]
 
 A cut leaves the first N bytes of the log; a flip changes one byte, half of them within likely length fields. Each
-damaged log is replayed twice: plainly, and with --recover. Failures are: a traceback or a signal, an error of more than
-one line, a replay of more than 20 s, an exit code other than 0, 1 and 3, or exit code 0 with a map, poses or counts
-that differ from the intact log's. Exits with 1 where any replay failed.
+damaged log is replayed twice: plainly, and with --recover. Failures are: a traceback or a signal, an error of more
+than one line, a replay of more than 20 s, an exit code other than 0, 1 and 3, or exit code 0 with a map, poses or
+counts that differ from the intact log's. Exits with 1 where any replay failed.
 """
 
 from __future__ import annotations

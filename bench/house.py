@@ -2,8 +2,9 @@
 
     python -m bench.house [--checkout DIR]
 
-Files per folder, the longest functions, functions with nine or more arguments, numeric module constants, public names
-that two modules define, and the files that name a kind, a mapper or a format of logs: those that a new one would touch.
+Files per folder, the longest functions, functions with nine or more arguments, numeric module constants, public
+names that two modules define, and the files that name a kind, a mapper or a format of logs: those that a new one
+would touch.
 """
 
 from __future__ import annotations

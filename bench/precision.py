@@ -1,10 +1,10 @@
-"""YOLO in less than single precision, or by another runtime: how fast, and what it costs in accuracy.
+"""Speed and accuracy of YOLO in half precision, in int8, and on OpenVINO.
 
     python -m bench.precision WEIGHTS SET
 
-WEIGHTS is a folder of weights, SET a set of ``prim-train dataset``: int8 is calibrated on its training split,
-accuracy is of its validation split. Times are of one tile, on all cores, in turns. OpenVINO is tried where it is
-installed. Needs the extra [train].
+WEIGHTS is a folder of weights, SET a data set of ``prim-train dataset``: int8 is calibrated on its training split,
+accuracy is measured on its validation split. Run times are those of one tile on all cores, measured in turns. OpenVINO
+is included where it is installed. Needs the extra [train].
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from detect.training.dataset import Sample, load_samples, read_image
 from detect.training.matches import LabelledImage
 
 CALIBRATION = 100
-"""Images that int8's ranges are found from."""
+"""Number of images that int8's ranges are calibrated on."""
 
 BATCH = 8
 
@@ -36,13 +36,21 @@ Run = Callable[[NDArray[np.float32]], NDArray[np.float32]]
 
 
 def images_of(chosen: Sequence[Sample]) -> NDArray[np.float32]:
-    """Images (N, 3, TILE_SIZE, TILE_SIZE) as the network takes them."""
+    """Return images (N, 3, TILE_SIZE, TILE_SIZE), the network's input."""
     stacked = np.stack([read_image(sample) for sample in chosen]).transpose(0, 3, 1, 2)
     return np.ascontiguousarray(stacked, np.float32) / np.float32(255)
 
 
 def half(weights: Path, folder: Path) -> Path:
-    """Arithmetic in half precision."""
+    """Convert a network to half-precision arithmetic.
+
+    Args:
+        weights: The network's file.
+        folder: Where the converted one goes.
+
+    Returns:
+        Its file.
+    """
     import onnx
     from onnxruntime.transformers.float16 import convert_float_to_float16
 
@@ -52,14 +60,14 @@ def half(weights: Path, folder: Path) -> Path:
 
 
 def widened(weights: Path) -> Any:
-    """The network with its weights in single precision, as before export halves them."""
+    """Load a network with its weights in single precision, as they were before export."""
     import onnx
     from onnx import TensorProto, numpy_helper
 
     model = onnx.load(str(weights))
-    kept = {tensor.name: tensor for tensor in model.graph.initializer}
+    initializers = {tensor.name: tensor for tensor in model.graph.initializer}
     for node in [node for node in model.graph.node if node.op_type == "Cast" and node.input[0].endswith(".half")]:
-        tensor = kept[node.input[0]]
+        tensor = initializers[node.input[0]]
         model.graph.initializer.append(
             numpy_helper.from_array(numpy_helper.to_array(tensor).astype(np.float32), node.output[0])
         )
@@ -70,7 +78,16 @@ def widened(weights: Path) -> Any:
 
 
 def int8(weights: Path, folder: Path, chosen: Sequence[Sample]) -> Path:
-    """Convolutions in eight bits, with ranges from some images; what comes behind them stays as it is."""
+    """Quantise a network's convolutions to eight bits; the other operators stay in single precision.
+
+    Args:
+        weights: The network's file.
+        folder: Where the quantised one goes.
+        chosen: The images that ranges are calibrated on.
+
+    Returns:
+        Its file.
+    """
     import onnx
     from onnxruntime.quantization import CalibrationDataReader, QuantFormat, QuantType, quantize_static
 
@@ -117,7 +134,7 @@ def openvino_run(weights: Path, folder: Path, precision: str) -> Run:
 
 
 class _Session:
-    """A runtime in ONNX Runtime's clothes."""
+    """Any runtime behind the interface of ONNX Runtime's session."""
 
     def __init__(self, run: Run, like: Weights) -> None:
         self._run, self._like = run, like
@@ -130,30 +147,47 @@ class _Session:
 
 
 def accuracy(run: Run, like: Weights, chosen: Sequence[Sample]) -> tuple[float, float, float]:
-    """F1, mAP 0.5 and mAP 0.5-0.95."""
+    """Evaluate a network.
+
+    Args:
+        run: Runs it.
+        like: The weights whose model card it has.
+        chosen: The images.
+
+    Returns:
+        F1, mAP 0.5 and mAP 0.5-0.95 of the boxes.
+    """
     yolo = Yolo(replace(like, session=_Session(run, like)))
     scored = []
     for begin in range(0, len(chosen), BATCH):
-        scored += scored_candidates(
-            yolo, [LabelledImage(one, read_image(one)) for one in chosen[begin : begin + BATCH]]
-        )
+        batch = [LabelledImage(sample, read_image(sample)) for sample in chosen[begin : begin + BATCH]]
+        scored += scored_candidates(yolo, batch)
     row = score_boxes(scored)["all"]
     return row.f1, row.map50, row.map50_95
 
 
 def runs(weights: Path, folder: Path, training: Sequence[Sample]) -> dict[str, Run]:
-    """Every way of running the network that this machine has."""
-    found = {
-        "**ONNX Runtime, single precision** (shipped; weights kept in half)": onnx_run(weights),
+    """Make each variant of the network that this machine can run.
+
+    Args:
+        weights: The network's file.
+        folder: Where converted networks go.
+        training: Images that int8 is calibrated on.
+
+    Returns:
+        The variants by name.
+    """
+    variants = {
+        "**ONNX Runtime, single precision** (shipped; weights stored in half precision)": onnx_run(weights),
         "ONNX Runtime, half precision": onnx_run(half(weights, folder)),
         "ONNX Runtime, int8": onnx_run(int8(weights, folder, training[:CALIBRATION])),
     }
     try:
-        found["OpenVINO, single precision"] = openvino_run(weights, folder, "f32")
-        found["OpenVINO, bfloat16"] = openvino_run(weights, folder, "bf16")
+        variants["OpenVINO, single precision"] = openvino_run(weights, folder, "f32")
+        variants["OpenVINO, bfloat16"] = openvino_run(weights, folder, "bf16")
     except ImportError:
         print("OpenVINO is not installed: left out")
-    return found
+    return variants
 
 
 def main() -> None:
@@ -165,10 +199,10 @@ def main() -> None:
     training, chosen = (load_samples(options.set, like.card.mapper, split) for split in ("train", "val"))
     lines = ["| YOLO, one tile | best, ms | median, ms | F1 | mAP 0.5 | mAP 0.5–0.95 |", "|---|" + "---:|" * 5]
     with tempfile.TemporaryDirectory() as folder:
-        ways = runs(options.weights / DETECTOR_FILE, Path(folder), training)
+        variants = runs(options.weights / DETECTOR_FILE, Path(folder), training)
         tile = images_of(chosen[:1])
-        times = timed({name: lambda run=run: run(tile) for name, run in ways.items()})  # type: ignore[misc]
-        for name, run in ways.items():
+        times = timed({name: lambda run=run: run(tile) for name, run in variants.items()})  # type: ignore[misc]
+        for name, run in variants.items():
             scores = " | ".join(f"{value:.3f}" for value in accuracy(run, like, chosen))
             lines.append(f"| {name} | {times[name][0]:.1f} | {times[name][1]:.1f} | {scores} |")
     print("\n".join(lines))

@@ -1,10 +1,10 @@
-"""Ids over driven sessions: does each primitive keep one from its first confirmed detection on?
+"""Persistence of track ids over driven sessions, and false tracks.
 
     python -m bench.tracks [--sessions 50] [--mapper forward] [--every 20] [--update docs/detect.md]
 
-Sessions are driven for 40 s (seeds from 70000), poses are exact, noise is 50 mm; the detector looks every 20 scans.
-A primitive is kept where all confirmed detections of it (outlines overlap by half) have the id of the first; false
-are tracks that are confirmed in the last look and overlap no primitive by half.
+Sessions are driven for 40 s (seeds from 70000) with exact poses and a range noise of 50 mm; the detector runs every 20
+scans. A primitive's id persists where all confirmed detections of it (outline IoU of at least 0.5) have the id of the
+first one. A false track is one that is confirmed at the end and overlaps no primitive with an IoU of 0.5.
 """
 
 from __future__ import annotations
@@ -41,15 +41,24 @@ class DetectionCollector(NullViewer):
 
 
 def confirmed_ids(result: DetectionResult) -> dict[int, int]:
-    """Return the id of each true primitive whose track is confirmed and which it overlaps by half."""
-    found = [detection.primitive for detection in result.detections.found]
-    pairs = match_primitives(found, result.truth)
+    """Return, by the index of each true primitive, the id of the confirmed track with an outline IoU of 0.5 or more."""
+    detected = [detection.primitive for detection in result.detections.found]
+    pairs = match_primitives(detected, result.truth)
     identities = {pair.truth: result.identities[pair.detection] for pair in pairs if pair.iou >= 0.5}
     return {truth: identity.id for truth, identity in identities.items() if identity.confirmed}
 
 
 def session(seed: int, mapper: str, every: int) -> tuple[int, int, int]:
-    """How many primitives kept their id, how many were ever confirmed, how many false tracks there are in the end."""
+    """Record and replay a session, and evaluate its tracks.
+
+    Args:
+        seed: The session's seed.
+        mapper: Name of the mapper.
+        every: The detector runs every so many scans.
+
+    Returns:
+        Number of primitives whose id persisted, of those that were ever confirmed, and of false tracks at the end.
+    """
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "driven.mcap"
         options = SessionOptions(seed=seed, motion="drive", duration=40.0, rate=5.0, lidar=Lidar(noise_std=0.05))
@@ -57,23 +66,23 @@ def session(seed: int, mapper: str, every: int) -> tuple[int, int, int]:
         collector = DetectionCollector()
         Pipeline(path, ReplayOptions(mapper=mapper, detect_every=every), collector).run()
     first: dict[int, int] = {}
-    kept: dict[int, bool] = {}
+    persistent: dict[int, bool] = {}
     for result in collector.results:
         for truth, identity in confirmed_ids(result).items():
-            kept[truth] = kept.get(truth, True) and first.setdefault(truth, identity) == identity
+            persistent[truth] = persistent.get(truth, True) and first.setdefault(truth, identity) == identity
     last = collector.results[-1]
-    there = {pair.detection for pair in match_primitives([one.primitive for one in last.detections.found], last.truth)
-             if pair.iou >= 0.5}  # fmt: skip
-    false = sum(one.confirmed for k, one in enumerate(last.identities) if k not in there)
-    return sum(kept.values()), len(kept), false
+    detected = [detection.primitive for detection in last.detections.found]
+    true = {pair.detection for pair in match_primitives(detected, last.truth) if pair.iou >= 0.5}
+    false = sum(identity.confirmed for k, identity in enumerate(last.identities) if k not in true)
+    return sum(persistent.values()), len(persistent), false
 
 
-def table(of: Sequence[tuple[int, int, int]]) -> str:
-    kept, seen, false = (sum(column) for column in zip(*of, strict=True))
+def table(results: Sequence[tuple[int, int, int]]) -> str:
+    persistent, confirmed, false = (sum(column) for column in zip(*results, strict=True))
     return (
-        "| driven sessions | primitives confirmed | kept one id | false tracks a session, in the end |\n"
+        "| driven sessions | primitives confirmed | id persistent | false tracks per session, at the end |\n"
         "|---:|---:|---:|---:|\n"
-        f"| {len(of)} | {seen} | {kept / max(seen, 1):.1%} | {false / len(of):.2f} |"
+        f"| {len(results)} | {confirmed} | {persistent / max(confirmed, 1):.1%} | {false / len(results):.2f} |"
     )
 
 
@@ -87,10 +96,10 @@ def main() -> None:
     options = parser.parse_args()
     seeds = range(FIRST_SEED, FIRST_SEED + options.sessions)
     with ProcessPoolExecutor(options.workers) as pool:
-        found = list(pool.map(partial(session, mapper=options.mapper, every=options.every), seeds))
-    print(table(found))
+        results = list(pool.map(partial(session, mapper=options.mapper, every=options.every), seeds))
+    print(table(results))
     if options.update:
-        update(options.update, "tracks", table(found))
+        update(options.update, "tracks", table(results))
 
 
 if __name__ == "__main__":

@@ -660,7 +660,15 @@ def append_passing(
 
 @kernel
 def occlude(outlines: Any, k: int, p: Any, reach: float, rays: Any) -> None:
-    """Lower the OCCLUSION of rays (7, N) to where they meet a shape of circumradius ``reach`` (m)."""
+    """Lower the OCCLUSION of rays to where they meet a shape.
+
+    Args:
+        outlines: the kinds' outlines.
+        k: the kind's number.
+        p: (5,) parameters.
+        reach: the shape's circumradius (m).
+        rays: (7, N), changed in place.
+    """
     ranges, clearances, scratch = np.empty(BLOCK), np.empty(BLOCK), np.empty((SCRATCH_ROWS, BLOCK))
     size = rays.shape[1]
     for first in range(0, size, BLOCK):
@@ -695,7 +703,15 @@ def apply_occlusion(data: Any, background: Any, blocked: Any) -> None:
 
 @kernel
 def silhouette_clearances(outlines: Any, k: int, p: Any, rays: Any, out: Any) -> None:
-    """Set the clearances (N,) of rays (m): below 0 for a miss, -FAR where the shape lies behind."""
+    """Compute the clearances of rays.
+
+    Args:
+        outlines: the kinds' outlines.
+        k: the kind's number.
+        p: (5,) parameters.
+        rays: (7, N).
+        out: (N,) gets the clearances (m): below 0 for a miss, -FAR where the shape lies behind.
+    """
     ranges, scratch = np.empty(BLOCK), np.empty((SCRATCH_ROWS, BLOCK))
     for first in range(0, len(out), BLOCK):
         count = min(BLOCK, len(out) - first)
@@ -704,7 +720,15 @@ def silhouette_clearances(outlines: Any, k: int, p: Any, rays: Any, out: Any) ->
 
 @kernel
 def cast_rays(outlines: Any, k: int, p: Any, rays: Any, out: Any) -> None:
-    """Set the ranges (N,) of rays to a shape (m): FAR for a miss, 0 from inside."""
+    """Compute the ranges of rays to a shape.
+
+    Args:
+        outlines: the kinds' outlines.
+        k: the kind's number.
+        p: (5,) parameters.
+        rays: (7, N).
+        out: (N,) gets the ranges (m): FAR for a miss, 0 from inside.
+    """
     clearances, scratch = np.empty(BLOCK), np.empty((SCRATCH_ROWS, BLOCK))
     for first in range(0, len(out), BLOCK):
         count = min(BLOCK, len(out) - first)
@@ -715,10 +739,17 @@ def cast_rays(outlines: Any, k: int, p: Any, rays: Any, out: Any) -> None:
 
 @kernel
 def standardized_clearances(outlines: Any, k: int, p: Any, covariance: Any, rays: Any, blur: float, out: Any) -> None:
-    """Set the clearances (N,) of rays in standard deviations, for a shape whose parameters have a covariance (5, 5).
+    """Compute the clearances of rays in standard deviations, for a shape whose parameters are uncertain.
 
-    Below 0 for a miss, 0 where the footprint of half-width ``blur`` (m) meets an edge. A ray that is occluded before
-    it comes to the shape misses it for certain (-FAR).
+    Args:
+        outlines: the kinds' outlines.
+        k: the kind's number.
+        p: (5,) parameters.
+        covariance: (5, 5) of the parameters.
+        rays: (7, N).
+        blur: half-width of the footprint (m).
+        out: (N,) gets the clearances: below 0 for a miss, 0 where the footprint meets an edge, -FAR where a ray is
+            occluded before it comes to the shape.
     """
     heading = math.cos(p[THETA]), math.sin(p[THETA])
     form = outlines.form[k]
