@@ -109,7 +109,7 @@ def check(sessions: int) -> str:
         found = list(pool.map(features, jobs(CHECK_SEED, sessions)))
     levels = {"σ ≤ 0.1 m": lambda std: std <= 0.1, "σ ≥ 0.25 m": lambda std: std >= 0.25}
     lines = [
-        "| the map says | " + " | ".join(f"{name}: cells | of them occupied" for name in levels) + " |",
+        "| probability in the map | " + " | ".join(f"{name}: cells | share occupied" for name in levels) + " |",
         "|---|" + "---|---|" * len(levels),
     ]
     chosen = [
@@ -132,7 +132,7 @@ def check(sessions: int) -> str:
         errors.append(
             sum(abs(p[place == k].sum() - occupied[place == k].sum()) for k in range(len(BINS) - 1)) / len(p)
         )
-    lines.append("| calibration error | " + " | ".join(f" | {error:.4f}" for error in errors) + " |")
+    lines.append("| expected calibration error | " + " | ".join(f" | {error:.4f}" for error in errors) + " |")
     return "\n".join(lines)
 
 

@@ -146,7 +146,10 @@ def main() -> None:
     parser.add_argument("--update", type=Path)
     options = parser.parse_args()
     detector = Detector.load(options.weights, options.mapper)
-    lines = ["| noise | F1 | position, mm | width, mm | OpenCV: F1 | position, mm | width, mm |", "|---|" + "---:|" * 6]
+    lines = [
+        "| noise | F1 | position, mm | width, mm | OpenCV: F1 | position, mm | width, mm |",
+        "|---|" + "---:|" * 6,
+    ]
     for noise_std in NOISE:
         mapped = cases(options.mapper, noise_std, options.sessions)
         if noise_std == NOISE[1]:

@@ -68,7 +68,7 @@ def whole_seconds(scans: Posed, frame: GridFrame) -> tuple[float, float]:
 
 
 def speed(rounds: int, data: Path) -> str:
-    lines = ["| rays to map | one core | two cores | streaming, a scan: median | worst |", "|---|---|---|---|---|"]
+    lines = ["| workload | one core | two cores | streaming, per scan: median | worst |", "|---|---|---|---|---|"]
     work = {noise_std: workload(noise_std) for noise_std in SPEED_NOISE}
     finish_seconds(work[0.0], 2)
     update_seconds(work[0.0])
@@ -102,7 +102,7 @@ def speed(rounds: int, data: Path) -> str:
 
 
 def noise() -> str:
-    lines = ["| true σ | " + " | ".join(f"found from {start:g} m" for start in STARTS) + " | worst error |"]
+    lines = ["| true σ | " + " | ".join(f"estimate from {start:g} m" for start in STARTS) + " | largest error |"]
     lines.append("|---|" + "---|" * (len(STARTS) + 1))
     for noise_std in FOUND_NOISE:
         sessions = [session_of(seed, noise_std) for seed in SEEDS]

@@ -103,7 +103,7 @@ def compare(scans: Posed, frame: GridFrame) -> dict[str, tuple[float, float]]:
         forward.accumulate(scan, pose)
     fit = forward.fit()
     maps["forward, grid()"] = fit.grid().probability
-    maps["forward, its stopping probabilities"] = fit.stopping
+    maps["forward, stopping probabilities"] = fit.stopping
     return {name: score(array, frame, rays_of(training), held_out) for name, array in maps.items()}
 
 

@@ -86,9 +86,9 @@ def fusion_errors(seed: int) -> Errors:
             assert fused.covariances is not None and fused.fusion is not None
             if sensors == SENSORS:
                 nodes = fused.fusion.nodes
-                errors["filtered forwards only"] = estimate_errors(fused.fusion, truth, times.stamps, smooth=False)
+                errors["filtered only"] = estimate_errors(fused.fusion, truth, times.stamps, smooth=False)
                 known = Fusion(nodes, TRUE_NOISE)
-                errors["smoothed, the noise known"] = estimate_errors(known, truth, times.stamps)
+                errors["smoothed, true noise"] = estimate_errors(known, truth, times.stamps)
                 errors["frame"] = normalised_frame_error(fused, truth)
             nees = pose_nees(fused.poses, truth, fused.covariances)
             errors[f"**smoothed**: {name}"] = (*pose_rmse(fused.poses, truth), nees)
@@ -132,9 +132,9 @@ def fusion_table(seeds: Sequence[int], pool: ProcessPoolExecutor) -> str:
     bound = NORMAL_95 * math.sqrt(6 / n)
     lines += [
         "",
-        f"{n} sessions. NEES is the mean normalised error squared: 3 where covariances are right, and within "
-        f"{3 - bound:.2f} to {3 + bound:.2f} with 95 % chance over {n} independent sessions. The place of the map as "
-        f"a whole: errors over estimated standard deviations, root mean square, "
+        f"{n} sessions. NEES is the mean normalised error squared: 3 for consistent covariances, and "
+        f"{3 - bound:.2f} to {3 + bound:.2f} with 95 % probability over {n} independent sessions. The pose of the "
+        f"map frame: errors over estimated standard deviations, root mean square, "
         f"{', '.join(f'{value:.2f}' for value in np.sqrt((z**2).mean(axis=0)))} (x, y, heading).",
     ]
     return "\n".join(lines)
@@ -161,15 +161,15 @@ def speed_table() -> str:
     count = len(nodes.stamps)
     return "\n".join(
         [
-            "| over 600 s of log, 6000 of each reading | time | x real time |",
+            "| 600 s of log, 6000 readings of each sensor | time | x real time |",
             "|---|---:|---:|",
-            f"| all of it: reading the log, noise, filter, smoother | {whole:.3f} s | {600 / whole:,.0f} |",
-            f"| noise, found from the readings | {estimation:.3f} s | {600 / estimation:,.0f} |",
+            f"| in all: reading the log, noise estimation, filter, smoother | {whole:.3f} s | {600 / whole:,.0f} |",
+            f"| noise estimation | {estimation:.3f} s | {600 / estimation:,.0f} |",
             f"| filter and smoother, once | {smoothing:.4f} s | {600 / smoothing:,.0f} |",
-            f"| filterpy's ExtendedKalmanFilter, forwards only | {reference:.3f} s | {600 / reference:,.0f} |",
+            f"| filterpy's ExtendedKalmanFilter, filter only | {reference:.3f} s | {600 / reference:,.0f} |",
             "",
-            f"A node takes {1e6 * smoothing / count:.1f} µs both ways, "
-            f"filterpy's {1e6 * reference / count:.0f} µs one way: "
+            f"Per node: filter and smoother {1e6 * smoothing / count:.1f} µs, "
+            f"filterpy's filter {1e6 * reference / count:.0f} µs: "
             f"{reference / smoothing:.0f} times as long.",
         ]
     )
@@ -344,7 +344,7 @@ def chain_table(seeds: Sequence[int], pool: ProcessPoolExecutor) -> str:
     for name, result in pool.map(chain, [(seed, name) for seed in seeds for name in CHAINS]):
         results[name].append(result)
     lines = [
-        "| poses | map F1 (within 1 cell) | F1 of primitives | place, mm | size, mm | place z | size z |",
+        "| poses | map F1 (within 1 cell) | F1 of primitives | position, mm | size, mm | position z | size z |",
         "|---|---:|---:|---:|---:|---:|---:|",
     ]
     for name, replays in results.items():
@@ -357,7 +357,7 @@ def chain_table(seeds: Sequence[int], pool: ProcessPoolExecutor) -> str:
             f"{mean_and_median(errors.sizes)} | {scaled_median(errors.position_z)} | {scaled_median(errors.size_z)} |"
         )
     return "\n".join(
-        [*lines, "", f"{len(seeds)} sessions; place and size: mean / median of what is found; z: median / 0.674."]
+        [*lines, "", f"{len(seeds)} sessions; position and size: mean / median of true positives; z: median / 0.674."]
     )
 
 

@@ -3,8 +3,8 @@
     python -m bench.precision WEIGHTS SET
 
 WEIGHTS is a folder of weights, SET a data set of ``prim-train dataset``: int8 is calibrated on its training split,
-accuracy is measured on its validation split. Run times are those of one tile on all cores, measured in turns. OpenVINO
-is included where it is installed. Needs the extra [train].
+accuracy is measured on its validation split. Run times are those of one tile on all cores, measured in turns.
+OpenVINO is included where it is installed. Needs the extra [train].
 """
 
 from __future__ import annotations

@@ -1,12 +1,13 @@
-"""Refinement on recorded sessions, from real detections: errors, error bars, the limit, kinds, time, and peers.
+"""Evaluation of refinement on recorded sessions: errors, their consistency and lower bounds, kinds, time, baselines.
 
     python -m bench.refine [--sessions 200] [--mapper forward] [--noise 0.05 0.25 0.5] [--update docs/refine.md]
 
-Sessions that no network was trained on (seeds from 40000), 2 x 2 m, warped, 500 rays, poses exact. All that is found
-counts, no outlier is left out. mAP is of the boxes around refined outlines, as every kind by its chance. Peers:
-OpenCV's contours on the same maps (bench/classical.py), and least squares on the end points within 10 cm of each true
-outline, of the true kind: circles (RANSAC, then least squares) and
-rectangles (the box of least area around them, ends cut by 2 %). OpenCV comes with the extra [train].
+Sessions that no network was trained on (seeds from 40000), 2 x 2 m, warped, 500 rays, exact poses; detections are the
+networks'. No outlier is left out. mAP is that of the bounding boxes of refined outlines, each counted as every kind
+with that kind's posterior probability. Baselines: OpenCV's contours on the same maps (bench/classical.py); and fits
+of the true kind to the end points within 10 cm of each true outline: circles by RANSAC and least squares, rectangles
+as the box of minimum area around the points between the 2nd and 98th percentiles. OpenCV comes with the extra
+[train].
 """
 
 from __future__ import annotations
@@ -24,7 +25,7 @@ from pathlib import Path
 import numpy as np
 
 from bench import classical
-from bench.limit import bounds, ratio
+from bench.limit import NORMAL_MEDIAN, bounds, ratio
 from bench.maps import update
 from bench.sessions import Session, recorded
 from detect.detector import Detector
@@ -43,24 +44,41 @@ from recorder.session import SessionOptions
 
 FIRST_SEED = 40_000
 ARENA = np.array([(-1, -1, 1, -1), (1, -1, 1, 1), (1, 1, -1, 1), (-1, 1, -1, -1)], float)
+"""The walls (4, 4) of all sessions: x and y (m) of both ends."""
+
+END_POINT_DISTANCE = 0.1
+"""End points this near (m) to a true outline are fitted."""
+
+MIN_END_POINTS = 20
 
 
 @dataclass(frozen=True)
-class Found:
-    """One true primitive: whether it was found, its kind right where it was seen, errors (m, rad) of the kind's own
-    parameters, their standard deviations as told, the bounds of Chapman and Robbins (for unbiased estimates) and of
-    Weiss and Weinstein (the limit of any); and the peers' mean errors (m) of place and size.
+class Estimate:
+    """One true primitive and what was estimated of it.
+
+    Attributes:
+        kind: The true kind.
+        located: Whether a detection of any kind overlaps it (outline IoU of at least 0.5).
+        found: Whether that one has the true kind; what follows holds of found ones, else it is empty.
+        errors: Errors (m, rad) in the order of Kind.parameters.
+        stds: Their estimated standard deviations.
+        unbiased: Their lower bounds for unbiased estimators (Chapman and Robbins).
+        limits: Their lower bounds for any estimator (Weiss and Weinstein).
+        position: Distance of the centroids (m).
+        angle: Error of the angle (rad); None where there is none.
+        sizes: Errors (m) of width and height.
+        opencv: Errors (m) of position and size by OpenCV's contours; None where these have not found it.
+        points: The same by a fit to the end points; None where there is none.
     """
 
     kind: Kind
-    seen: bool
-    right: bool
+    located: bool
     found: bool
     errors: tuple[float, ...] = ()
     stds: tuple[float, ...] = ()
     unbiased: tuple[float, ...] = ()
     limits: tuple[float, ...] = ()
-    place: float = math.nan
+    position: float = math.nan
     angle: float | None = None
     sizes: tuple[float, float] = (math.nan, math.nan)
     opencv: tuple[float, float] | None = None
@@ -69,9 +87,18 @@ class Found:
 
 @dataclass(frozen=True)
 class Outcome:
-    """One session: its primitives, how many were found in all by whom, the seconds of refinement."""
+    """The evaluation of one session.
 
-    primitives: tuple[Found, ...]
+    Attributes:
+        primitives: Of each true primitive.
+        detections: Number of refined detections.
+        scored: Their boxes, for mAP.
+        network: Numbers of true positives and of detections of the networks alone.
+        opencv: The same of OpenCV's contours.
+        refine_s: Run time of refinement (s).
+    """
+
+    primitives: tuple[Estimate, ...]
     detections: int
     scored: ScoredBoxes
     network: tuple[int, int]
@@ -80,110 +107,151 @@ class Outcome:
 
 
 def outcome(seed: int, noise_std: float, mapper: str) -> Outcome:
-    """Records a session, maps it, detects, refines, and holds all against the truth."""
+    """Record a session, map it, detect, refine, and evaluate all against the ground truth.
+
+    Args:
+        seed: The session's seed.
+        noise_std: Standard deviation of the range noise (m).
+        mapper: Name of the mapper.
+
+    Returns:
+        The evaluation.
+    """
     session = recorded(SessionOptions(seed=seed, lidar=Lidar(noise_std=noise_std)))
-    made = make_mapper(mapper, 0.01, session.frame.bounds)
+    session_mapper = make_mapper(mapper, 0.01, session.frame.bounds)
     for scan, pose in session.scans:
-        made.accumulate(scan, pose)
-    grid = made.finish()
+        session_mapper.accumulate(scan, pose)
+    grid = session_mapper.finish()
     detector = Detector.load(SHIPPED / mapper, mapper, 1)
     detections = detector.detect(grid)
-    between = time.perf_counter()
+    began = time.perf_counter()
     refined, _ = refine_detections(detections, session.scans, grid, None, 1)
     ended = time.perf_counter()
-    primitives = [one.primitive for one in refined.found]
-    stds = [dict(one.std or {}) for one in refined.found]
+    primitives = [detection.primitive for detection in refined.found]
+    stds = [dict(detection.std or {}) for detection in refined.found]
     pairs = {pair.truth: pair for pair in match_primitives(primitives, session.primitives)}
-    peer = classical.detect(grid)
-    peers = {pair.truth: pair for pair in match_primitives(peer, session.primitives) if pair.found}
+    baseline = classical.detect(grid)
+    matched = {pair.truth: pair for pair in match_primitives(baseline, session.primitives) if pair.found}
     limits = bounds(session.scans, session.primitives, ARENA, max(noise_std, 1e-3))
     rows = []
     for k, true in enumerate(session.primitives):
         pair = pairs.get(k)
-        opencv = (peers[k].position, (peers[k].width + peers[k].height) / 2) if k in peers else None
+        opencv = (matched[k].position, (matched[k].width + matched[k].height) / 2) if k in matched else None
         if pair is None or not pair.found:
-            seen = pair is not None and pair.iou >= 0.5
-            rows.append(Found(true.kind, seen, False, False, opencv=opencv))
+            located = pair is not None and pair.iou >= 0.5
+            rows.append(Estimate(true.kind, located, False, opencv=opencv))
             continue
-        one, names = primitives[pair.detection], true.kind.parameters
+        estimate, names = primitives[pair.detection], true.kind.parameters
         rows.append(
-            Found(
+            Estimate(
                 true.kind,
                 True,
                 True,
-                True,
-                own_errors(one, true),
+                parameter_errors(estimate, true),
                 tuple(stds[pair.detection][name] for name in names),
                 tuple(limits[k].chapman_robbins.tolist()),
                 tuple(limits[k].weiss_weinstein.tolist()),
                 pair.position,
-                angle_error(one, true),
+                angle_error(estimate, true),
                 (pair.width, pair.height),
                 opencv,
-                end_points(session, true),
+                end_point_errors(session, true),
             )
         )
-    networks = match_primitives([one.primitive for one in detections.found], session.primitives)
+    networks = match_primitives([detection.primitive for detection in detections.found], session.primitives)
     return Outcome(
         tuple(rows),
         len(primitives),
         scored_primitives(refined, session.primitives),
         (sum(pair.found for pair in networks), len(detections.found)),
-        (len(peers), len(peer)),
-        ended - between,
+        (len(matched), len(baseline)),
+        ended - began,
     )
 
 
-def own_errors(one: Primitive, true: Primitive) -> tuple[float, ...]:
-    """Errors of a kind's own parameters, the angle's modulo the shape's symmetry."""
-    turn: tuple[float, ...] = ()
-    if one.theta is not None and true.theta is not None:
-        turn = (0.0 if true.symmetry is None else angle_difference(one.theta, true.theta, true.symmetry),)
-    sizes = tuple(a - b for a, b in zip(one.size, true.size, strict=True))
-    return (one.x - true.x, one.y - true.y, *turn, *sizes)
+def parameter_errors(estimate: Primitive, true: Primitive) -> tuple[float, ...]:
+    """Compute the errors of all parameters.
+
+    Args:
+        estimate: The estimate.
+        true: The true primitive, of the same kind.
+
+    Returns:
+        Errors (m, rad) in the order of Kind.parameters, the angle's modulo the true shape's symmetry.
+    """
+    angle: tuple[float, ...] = ()
+    if estimate.theta is not None and true.theta is not None:
+        angle = (0.0 if true.symmetry is None else angle_difference(estimate.theta, true.theta, true.symmetry),)
+    sizes = tuple(a - b for a, b in zip(estimate.size, true.size, strict=True))
+    return (estimate.x - true.x, estimate.y - true.y, *angle, *sizes)
 
 
-def end_points(session: Session, true: Primitive) -> tuple[float, float] | None:
-    """Errors of place and size (m) of a circle or rectangle that is fitted to the end points near it."""
+def end_point_errors(session: Session, true: Primitive) -> tuple[float, float] | None:
+    """Fit a circle or rectangle to the end points near a true primitive.
+
+    Args:
+        session: The session.
+        true: The primitive.
+
+    Returns:
+        Errors (m) of position and size; None for other kinds, or with too few points.
+    """
     if true.kind not in (Kind.CIRCLE, Kind.RECTANGLE, Kind.SQUARE):
         return None
     points = np.concatenate([scan.points(pose) for scan, pose in session.scans])
-    points = points[is_within(true, points, 0.1)]
-    if len(points) < 20:
+    points = points[is_within(true, points, END_POINT_DISTANCE)]
+    if len(points) < MIN_END_POINTS:
         return None
     if true.kind is Kind.CIRCLE:
         x, y, radius = ransac_circle(points)
         return math.hypot(x - true.x, y - true.y), abs(radius - true.size[0])
-    x, y, width, height = least_box(points)
+    x, y, width, height = min_area_box(points)
     sizes = true.width_height
     return math.hypot(x - true.x, y - true.y), (abs(width - sizes[0]) + abs(height - sizes[1])) / 2
 
 
 def ransac_circle(points: FloatArray, within: float = 0.02, trials: int = 100) -> tuple[float, float, float]:
-    """A circle by RANSAC and least squares."""
+    """Fit a circle by RANSAC and least squares.
+
+    Args:
+        points: Points (N, 2) in m.
+        within: Largest distance (m) of inliers.
+        trials: Number of hypotheses.
+
+    Returns:
+        The centre's x and y, and the radius (m).
+    """
     rng = np.random.default_rng(0)
     best = np.zeros(len(points), bool)
     for _ in range(trials):
-        x, y, radius = least_circle(points[rng.choice(len(points), 3, replace=False)])
+        x, y, radius = least_squares_circle(points[rng.choice(len(points), 3, replace=False)])
         near = np.abs(np.hypot(points[:, 0] - x, points[:, 1] - y) - radius) < within
         if np.count_nonzero(near) > np.count_nonzero(best):
             best = near
-    return least_circle(points[best] if np.count_nonzero(best) > 3 else points)
+    return least_squares_circle(points[best] if np.count_nonzero(best) > 3 else points)
 
 
-def least_circle(points: FloatArray) -> tuple[float, float, float]:
-    """A circle by linear least squares."""
+def least_squares_circle(points: FloatArray) -> tuple[float, float, float]:
+    """Fit a circle to points (N, 2) by linear least squares; return the centre's x and y, and the radius (m)."""
     a = np.column_stack((points, np.ones(len(points))))
     c = np.linalg.lstsq(a, -(points**2).sum(axis=1), rcond=None)[0]
     x, y = -c[0] / 2, -c[1] / 2
     return float(x), float(y), math.sqrt(max(x * x + y * y - c[2], 1e-9))
 
 
-def least_box(points: FloatArray, cut: float = 2.0) -> tuple[float, float, float, float]:
-    """The rectangle of least area around points, of every degree of turn; what sticks out most is left out."""
+def min_area_box(points: FloatArray, cut: float = 2.0) -> tuple[float, float, float, float]:
+    """Find the rectangle of minimum area around points, over angles in steps of a degree.
+
+    Args:
+        points: Points (N, 2) in m.
+        cut: Percentage of the points that is left out at each end of both axes.
+
+    Returns:
+        The centre's x and y, and the longer and the shorter side (m).
+    """
     best = (math.inf, 0.0, 0.0, 0.0, 0.0)
-    for turn in np.radians(np.arange(0, 90)):
-        axes = np.array([[math.cos(turn), -math.sin(turn)], [math.sin(turn), math.cos(turn)]])
+    for angle in np.radians(np.arange(0, 90)):
+        axes = np.array([[math.cos(angle), -math.sin(angle)], [math.sin(angle), math.cos(angle)]])
         low, high = np.percentile(points @ axes, [cut, 100 - cut], axis=0)
         sides, middle = high - low, axes @ ((low + high) / 2)
         if sides.prod() < best[0]:
@@ -191,45 +259,61 @@ def least_box(points: FloatArray, cut: float = 2.0) -> tuple[float, float, float
     return best[1:]
 
 
-def quality(name: str, of: Sequence[Outcome]) -> str:
-    """One row: F1 of networks, peers and refinement, kinds, errors, error bars, time."""
-    rows = [row for one in of for row in one.primitives]
-    found = [row for row in rows if row.found]
-    seen = [row for row in rows if row.seen]
-    hits, there = len(found), len(rows)
+def quality(name: str, outcomes: Sequence[Outcome]) -> str:
+    """Return a row of the table of errors.
 
-    def f1(right: int, all_found: int) -> str:
-        return f"{2 * right / max(all_found + there, 1):.3f}"
+    Args:
+        name: Its first cell.
+        outcomes: The sessions.
+
+    Returns:
+        F1 of networks, OpenCV and refinement, mAP, kinds, errors, normalised errors, and run time.
+    """
+    rows = [row for session in outcomes for row in session.primitives]
+    found = [row for row in rows if row.found]
+    located = [row for row in rows if row.located]
+    hits, true = len(found), len(rows)
+
+    def f1(true_positives: int, detected: int) -> str:
+        return f"{2 * true_positives / max(detected + true, 1):.3f}"
 
     if not found:
         return f"| {name} | nothing found" + " |" * 10
     z = np.concatenate([np.divide(row.errors, row.stds) for row in found])
     angles = [row.angle for row in found if row.angle is not None]
     sizes = 1000 * np.array([row.sizes for row in found])
-    place = 1000 * np.array([row.place for row in found])
-    scores = score_boxes([one.scored for one in of])["all"]
-    each = [one.refine_s / len(one.primitives) for one in of if one.primitives]
+    position = 1000 * np.array([row.position for row in found])
+    scores = score_boxes([session.scored for session in outcomes])["all"]
+    seconds = [session.refine_s / len(session.primitives) for session in outcomes if session.primitives]
     cells = (
         name,
-        f1(sum(one.network[0] for one in of), sum(one.network[1] for one in of)),
-        f1(sum(one.opencv[0] for one in of), sum(one.opencv[1] for one in of)),
-        f1(hits, sum(one.detections for one in of)),
+        f1(sum(session.network[0] for session in outcomes), sum(session.network[1] for session in outcomes)),
+        f1(sum(session.opencv[0] for session in outcomes), sum(session.opencv[1] for session in outcomes)),
+        f1(hits, sum(session.detections for session in outcomes)),
         f"{scores.map50:.3f} / {scores.map50_95:.3f}",
-        f"{sum(row.right for row in seen) / max(len(seen), 1):.1%}",
-        f"{place.mean():.2f} / {np.median(place):.2f}",
+        f"{hits / max(len(located), 1):.1%}",
+        f"{position.mean():.2f} / {np.median(position):.2f}",
         f"{sizes.mean():.2f} / {np.median(sizes):.2f}",
         f"{np.degrees(np.mean(angles)):.2f} / {np.degrees(np.median(angles)):.2f}",
-        f"{math.sqrt(np.mean(z**2)):.2f} / {np.median(np.abs(z)) / 0.674:.2f}",
-        f"{1000 * np.median(each):.0f}",
+        f"{math.sqrt(np.mean(z**2)):.2f} / {np.median(np.abs(z)) / NORMAL_MEDIAN:.2f}",
+        f"{1000 * np.median(seconds):.0f}",
     )
     return f"| {' | '.join(cells)} |"
 
 
-def limits_table(noise_std: float, of: Sequence[Outcome]) -> list[str]:
-    """The ratio to the limit of each kind's parameters."""
+def limits_table(noise_std: float, outcomes: Sequence[Outcome]) -> list[str]:
+    """Return the rows of the ratios of errors to their lower bounds.
+
+    Args:
+        noise_std: Standard deviation of the range noise (m).
+        outcomes: The sessions.
+
+    Returns:
+        A row for each kind.
+    """
     lines = []
     for kind in Kind:
-        found = [row for one in of for row in one.primitives if row.found and row.kind is kind]
+        found = [row for session in outcomes for row in session.primitives if row.found and row.kind is kind]
         cells = []
         for name in ("x", "y", "theta", "size", "size 2"):
             sizes = {"size": kind.sizes[0], "size 2": kind.sizes[-1] if len(kind.sizes) > 1 else None}
@@ -245,24 +329,32 @@ def limits_table(noise_std: float, of: Sequence[Outcome]) -> list[str]:
     return lines
 
 
-def peers_table(noise_std: float, of: Sequence[Outcome]) -> str:
-    """Median errors of place and size (mm) beside the peers', each over what the peer has too."""
+def baselines_row(noise_std: float, outcomes: Sequence[Outcome]) -> str:
+    """Return a row of median errors of position and size beside those of each baseline.
 
-    def pair(rows: Sequence[Found], errors: Sequence[tuple[float, float]]) -> str:
+    Args:
+        noise_std: Standard deviation of the range noise (m).
+        outcomes: The sessions.
+
+    Returns:
+        The row; each pair of errors is over the primitives that both have found.
+    """
+
+    def pair(rows: Sequence[Estimate], errors: Sequence[tuple[float, float]]) -> str:
         if not rows:
             return "– | – | –"
-        ours = np.median([(row.place, sum(row.sizes) / 2) for row in rows], axis=0)
+        ours = np.median([(row.position, sum(row.sizes) / 2) for row in rows], axis=0)
         theirs = np.median(errors, axis=0)
         factor = "–" if not ours.all() else f"{theirs[0] / ours[0]:.0f} × / {theirs[1] / ours[1]:.0f} ×"
-        mine, other = 1000 * ours, 1000 * theirs
-        return f"{mine[0]:.2f} / {mine[1]:.2f} | {other[0]:.1f} / {other[1]:.1f} | {factor}"
+        first, second = 1000 * ours, 1000 * theirs
+        return f"{first[0]:.2f} / {first[1]:.2f} | {second[0]:.1f} / {second[1]:.1f} | {factor}"
 
-    found = [row for one in of for row in one.primitives if row.found]
+    found = [row for session in outcomes for row in session.primitives if row.found]
     opencv = [row for row in found if row.opencv]
     points = [row for row in found if row.points]
-    cells = pair(opencv, [row.opencv for row in opencv if row.opencv])
-    more = pair(points, [row.points for row in points if row.points])
-    return f"| {1000 * noise_std:g} mm | {cells} | {more} |"
+    contours = pair(opencv, [row.opencv for row in opencv if row.opencv])
+    fits = pair(points, [row.points for row in points if row.points])
+    return f"| {1000 * noise_std:g} mm | {contours} | {fits} |"
 
 
 def main() -> None:
@@ -284,36 +376,56 @@ def main() -> None:
 
 
 def short(content: str) -> str:
-    """The first table without what only the long one explains."""
+    """Return the first table without the columns that only docs/refine.md explains."""
     rows = [line.split("|")[1:-1] for line in content.split("\n\n")[0].splitlines()]
     chosen = [0, 1, 2, 3, 6, 7, 8, 9]
     return "\n".join("|" + "|".join(row[k] for k in chosen) + "|" for row in rows)
 
 
 HEAD = [
-    "F1: networks | OpenCV | **refined** | mAP50 / 50-95 | kind | place, mm | size, mm | angle, ° | z | ms each |",
+    "F1: networks | OpenCV | **refined** | mAP50 / 50-95 | kind | position, mm | size, mm | angle, ° | z | ms |",
     "|" + "---:|" * 10,
 ]
 
 
 def sessions(pool: ProcessPoolExecutor, options: argparse.Namespace, noise_std: float) -> list[Outcome]:
-    """The outcomes of all seeds."""
+    """Evaluate all sessions at one noise level.
+
+    Args:
+        pool: The processes.
+        options: The command's options.
+        noise_std: Standard deviation of the range noise (m).
+
+    Returns:
+        The evaluations.
+    """
     seeds = range(options.first_seed, options.first_seed + options.sessions)
     return list(pool.map(partial(outcome, noise_std=noise_std, mapper=options.mapper), seeds))
 
 
 def tables(pool: ProcessPoolExecutor, options: argparse.Namespace) -> str:
-    """Errors, ratios to the limit, and peers at each noise level."""
+    """Return the tables of errors, of their ratios to the lower bounds, and of the baselines.
+
+    Args:
+        pool: The processes.
+        options: The command's options.
+
+    Returns:
+        The tables, separated by empty lines.
+    """
     errors = ["| noise | " + HEAD[0], "|---" + HEAD[1]]
     limits = ["| noise | kind | found | x | y | angle | size | size 2 |", "|---|---|" + "---:|" * 6]
-    peers = ["| noise | ours, mm | OpenCV, mm | factor | ours, mm | end points, mm | factor |", "|---|" + "---:|" * 6]
+    baselines = [
+        "| noise | ours, mm | OpenCV, mm | factor | ours, mm | end points, mm | factor |",
+        "|---|" + "---:|" * 6,
+    ]
     for noise_std in options.noise:
-        of = sessions(pool, options, noise_std)
-        errors.append(quality(f"{1000 * noise_std:g} mm", of))
-        limits += limits_table(noise_std, of)
-        peers.append(peers_table(noise_std, of))
-        print(errors[-1], *limits[-5:], peers[-1], sep="\n", flush=True)
-    return "\n".join([*errors, "", *limits, "", *peers])
+        outcomes = sessions(pool, options, noise_std)
+        errors.append(quality(f"{1000 * noise_std:g} mm", outcomes))
+        limits += limits_table(noise_std, outcomes)
+        baselines.append(baselines_row(noise_std, outcomes))
+        print(errors[-1], *limits[-5:], baselines[-1], sep="\n", flush=True)
+    return "\n".join([*errors, "", *limits, "", *baselines])
 
 
 if __name__ == "__main__":

@@ -1,13 +1,13 @@
-"""Whether two checkouts come to the same results: what a change that must change nothing is held against.
+"""Regression check: whether two checkouts give the same results.
 
     python -m bench.same keep OUT.json [--checkout DIR] [--sessions 20] [--data FOLDER] [--quick]
     python -m bench.same compare BEFORE.json AFTER.json
 
 ``keep`` runs a checkout's ``prim-record`` and ``prim-replay``: sessions of all noise levels, each through the three
-mappers, with refinement and without; the logs pillars4.mcap and csail.mcap where they are at hand; and a
-driven session with ``--match-scans``. It keeps what was recorded (as a hash) and the reports, but for timings and
-paths. ``compare`` says which differ, and by how much at most; it exits with 1 where anything but a number's last
-digits differs (beyond TOLERANCE).
+mappers, with refinement and without; driven sessions with ``--match-scans``, with ``--pose fused`` and with
+``--detect-every``; and the logs pillars4.mcap and csail.mcap where they are available. It stores hashes of the
+recorded logs, and the reports without timings and paths. ``compare`` prints which differ, and by how much at most; it
+exits with 1 where any difference exceeds TOLERANCE.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ NOISE = (0.0, 0.05, 0.075, 0.1, 0.25, 0.375, 0.5)
 FIRST_SEED = 7_000
 
 TOLERANCE = 1e-6
-"""Numbers that differ by no more than this (of themselves, or m, rad) are the same but for their last digits."""
+"""Largest difference of numbers that count as equal: relative above 1, absolute below (m, rad)."""
 
 WORKER = """
 import json, sys
@@ -44,11 +44,19 @@ for command, *arguments in json.load(sys.stdin):
     except SystemExit as ended:
         print(json.dumps([command, *arguments, ended.code]), file=sys.stderr)
 """
-"""Runs a list of commands one after the other in one process: imports and kernels are loaded once."""
+"""Runs a list of commands in one process, so that imports and kernels are loaded once."""
 
 
 def commands(sessions: int, data: Path) -> Iterator[tuple[str, list[list[str]]]]:
-    """Each log's name, and the commands that record it and replay it."""
+    """Yield the commands for each log.
+
+    Args:
+        sessions: Number of recorded sessions.
+        data: The folder of the real logs.
+
+    Yields:
+        The log's name, and the commands that record and replay it.
+    """
     for number in range(sessions):
         name, noise = f"session{number}", NOISE[number % len(NOISE)]
         extra = ["--no-walls"] if number % 5 == 4 else []
@@ -61,8 +69,8 @@ def commands(sessions: int, data: Path) -> Iterator[tuple[str, list[list[str]]]]
         ]
         yield name, [[*record, "--rays", rays, "--quiet", *extra], *replays]
     driven = ["--motion", "drive", "--duration", "30", "--quiet", "--seed", str(FIRST_SEED)]
-    looks = ["--mapper", "forward", "--match-scans", "--pose", "odom"]
-    yield "driven", [["prim-record", "driven.mcap", *driven], _replay("driven.mcap", "driven.matched", *looks)]
+    matched = ["--mapper", "forward", "--match-scans", "--pose", "odom"]
+    yield "driven", [["prim-record", "driven.mcap", *driven], _replay("driven.mcap", "driven.matched", *matched)]
     fused = ["--mapper", "forward", "--pose", "fused", "--detect-every", "60"]
     yield "fused", [["prim-record", "fused.mcap", *driven], _replay("fused.mcap", "fused.looks", *fused, rrd=True)]
     if (data / "pillars4.mcap").exists():
@@ -84,10 +92,19 @@ def _replay(log: str, name: str, *options: str, rrd: bool = False) -> list[str]:
 
 
 def keep(checkout: Path, sessions: int, data: Path) -> dict[str, Any]:
-    """What a checkout makes of all sessions and logs: hashes of logs, reports without timings and paths."""
+    """Run a checkout on all sessions and logs.
+
+    Args:
+        checkout: The checkout.
+        sessions: Number of recorded sessions.
+        data: The folder of the real logs.
+
+    Returns:
+        Hashes of the recorded logs, and the reports without timings and paths.
+    """
     with tempfile.TemporaryDirectory() as folder, ThreadPoolExecutor(os.cpu_count()) as pool:
         lists = [work for _, work in commands(sessions, data)]
-        # the slowest ones, which come last, first
+        # in reverse order: the slowest come last
         list(pool.map(lambda work: _run(checkout, Path(folder), work), lists[::-1]))
         logs = {path.name: _digest(path) for path in sorted(Path(folder).glob("*.mcap"))}
         reports = {
@@ -123,7 +140,16 @@ def _stripped(report: dict[str, Any]) -> dict[str, Any]:
 
 
 def differences(before: Any, after: Any, at: str = "") -> Iterator[tuple[str, float]]:
-    """Where two JSON values differ, and by how much: infinitely where they are no numbers."""
+    """Compare two JSON values.
+
+    Args:
+        before: The first one.
+        after: The second one.
+        at: Path to them.
+
+    Yields:
+        The path of each difference and its size: relative above 1, absolute below; infinite except between numbers.
+    """
     if isinstance(before, dict) and isinstance(after, dict):
         for key in before.keys() | after.keys():
             if key not in before or key not in after:
@@ -139,7 +165,15 @@ def differences(before: Any, after: Any, at: str = "") -> Iterator[tuple[str, fl
 
 
 def compare(before: dict[str, Any], after: dict[str, Any]) -> bool:
-    """Prints what differs; whether all is the same but for numbers' last digits."""
+    """Print the differences of two runs.
+
+    Args:
+        before: The first run.
+        after: The second run.
+
+    Returns:
+        Whether no difference exceeds TOLERANCE.
+    """
     worst = 0.0
     for part in ("logs", "reports"):
         one, other = before[part], after[part]
@@ -160,7 +194,7 @@ def compare(before: dict[str, Any], after: dict[str, Any]) -> bool:
 
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    parser.add_argument("--checkout", type=Path, default=ROOT, help="whose command lines are run (this one's)")
+    parser.add_argument("--checkout", type=Path, default=ROOT, help="the checkout that is run (default: this one)")
     parser.add_argument("--sessions", type=int, default=20)
     parser.add_argument("--data", type=Path, default=DATA, help="the folder of pillars4.mcap and csail.mcap")
     parser.add_argument("--quick", action="store_true", help="five sessions and no real log")

@@ -1,8 +1,8 @@
-"""How fast prim is, beside a peer where there is one, in turns within one run: absolute times drift, ratios hardly.
+"""Speed and memory of prim; mapping also beside MRPT, in turns within one run, since absolute times drift.
 
     python -m bench.speed [--rounds 5] [--peers ../shared/peers] [--update docs/speed.md]
 
-The peer is MRPT's COccupancyGridMap2D::insertObservation (Debian: libmrpt-maps-dev, cmake, g++), built in a scratch
+The peer is MRPT's COccupancyGridMap2D::insertObservation (Debian: libmrpt-maps-dev, cmake, g++), built in a temporary
 folder from the peers' sources; without them its rows are left out. Mapping runs on one core, whole commands on all.
 """
 
@@ -45,19 +45,19 @@ from recorder.session import SessionOptions, record_session
 BIN = Path(sys.executable).parent
 SCANS, RAYS = 100, 500
 TURNS = 4
-"""How often a round lets the peer and each mapper map, in turn."""
+"""Number of times that the peer and each mapper are run in turn in a round."""
 
 Rows = dict[str, list[float]]
 
 
 def room() -> tuple[list[Scan], list[Pose2D]]:
-    """The peers' workload: 100 scans of 500 rays in a room of 2 x 2 m with two circles and two boxes."""
-    import scans  # the peers' own
+    """Return the peers' workload: 100 scans of 500 rays in a room of 2 x 2 m with two circles and two boxes."""
+    import scans  # a module of the peers' sources
 
     poses, bearings, ranges, _ = scans.make()
     increment = float(bearings[1] - bearings[0])
-    made = [Scan(0, "laser", float(bearings[0]), increment, 0.03, 10.0, row.astype(np.float32)) for row in ranges]
-    return made, [Pose2D(*pose) for pose in poses.tolist()]
+    workload = [Scan(0, "laser", float(bearings[0]), increment, 0.03, 10.0, row.astype(np.float32)) for row in ranges]
+    return workload, [Pose2D(*pose) for pose in poses.tolist()]
 
 
 def seconds(work: Callable[[], object]) -> float:
@@ -68,7 +68,7 @@ def seconds(work: Callable[[], object]) -> float:
 
 @contextmanager
 def one_core() -> Iterator[None]:
-    """Holds this process, and those that it starts, to one core."""
+    """Restrict this process, and those that it starts, to one core."""
     cores = os.sched_getaffinity(0)
     os.sched_setaffinity(0, {min(cores)})
     try:
@@ -78,9 +78,17 @@ def one_core() -> Iterator[None]:
 
 
 def mapping_rate(name: str, scans: list[Scan], poses: list[Pose2D]) -> float:
-    """Rays per second through the public mapper: the best of 11 maps, as the peer's program tells it.
+    """Measure the rays per second of a mapper: the best of 11 maps, as the peer's program reports it.
 
-    The best is what the machine can do where nothing else disturbs it; medians of runs this short are noise.
+    The best run is the one least disturbed by other processes; medians of such short runs are noise.
+
+    Args:
+        name: Name of the mapper.
+        scans: The scans.
+        poses: The laser's poses.
+
+    Returns:
+        Rays per second.
     """
 
     def work() -> None:
@@ -92,7 +100,15 @@ def mapping_rate(name: str, scans: list[Scan], poses: list[Pose2D]) -> float:
 
 
 def build_peer(peers: Path, folder: Path) -> Path | None:
-    """The peer's program, None where it cannot be built."""
+    """Build the peer's program.
+
+    Args:
+        peers: The folder of its sources.
+        folder: Where it is built.
+
+    Returns:
+        The program; None where it cannot be built.
+    """
     if not (peers / "bench_mrpt.cpp").exists() or not shutil.which("cmake"):
         return None
     for file in peers.iterdir():
@@ -103,7 +119,7 @@ def build_peer(peers: Path, folder: Path) -> Path | None:
 
 
 def peer_rate(program: Path) -> float:
-    """MRPT's best rays per second of 11 maps, without widened beams."""
+    """Return MRPT's rays per second: the best of 11 maps, without beam widening."""
     printed = subprocess.run([program], cwd=program.parents[1], capture_output=True, text=True, check=True).stdout
     found = re.search(r"widening=0 best (\d+) rays/s", printed)
     assert found, printed
@@ -111,7 +127,13 @@ def peer_rate(program: Path) -> float:
 
 
 def long_log(path: Path, scans: int, beams: int) -> None:
-    """A log of a robot that goes round in circles, 10 scans a second, odometry with each."""
+    """Write a log of a robot that drives in circles, with 10 scans a second and odometry with each.
+
+    Args:
+        path: The log.
+        scans: Number of scans.
+        beams: Number of beams of each.
+    """
     rng = np.random.default_rng(0)
     ranges = rng.uniform(0.3, 3.0, (64, beams)).astype(np.float32)
     with LogWriter(path) as log:
@@ -126,7 +148,7 @@ def long_log(path: Path, scans: int, beams: int) -> None:
 
 
 def reading_rate(log: Path) -> float:
-    """Decoded scans per second."""
+    """Return the number of decoded scans per second."""
     count = 0
 
     def work() -> None:
@@ -138,7 +160,15 @@ def reading_rate(log: Path) -> float:
 
 
 def command(folder: Path, *arguments: object) -> tuple[float, int]:
-    """Wall seconds and peak memory (KiB) of one command."""
+    """Run a command.
+
+    Args:
+        folder: Its working directory.
+        arguments: The program and its arguments.
+
+    Returns:
+        Wall time (s) and peak memory (KiB).
+    """
     before = time.perf_counter()
     process = subprocess.Popen([str(argument) for argument in arguments], cwd=folder, stdout=subprocess.DEVNULL)
     _, status, usage = os.wait4(process.pid, 0)
@@ -147,18 +177,36 @@ def command(folder: Path, *arguments: object) -> tuple[float, int]:
 
 
 def recording_rate(folder: Path, motion: str, session_seconds: float) -> float:
-    """Session seconds per second of recording, within one process."""
+    """Measure recording, within this process.
+
+    Args:
+        folder: Where the logs go.
+        motion: «warp» or «drive».
+        session_seconds: Duration of the session (s).
+
+    Returns:
+        Session time over wall time.
+    """
     stops = (round(session_seconds * 10 / 20), 20)
     options = SessionOptions(seed=1, motion=motion, stops=stops, duration=session_seconds)
     session = record_session(folder / "warm.mcap", SessionOptions(seed=1, stops=(2, 2)))
-    taken = seconds(lambda: record_session(folder / "r.mcap", options))
+    wall_time = seconds(lambda: record_session(folder / "r.mcap", options))
     assert session.scans
     with open_log(folder / "r.mcap") as log:
-        return log.topics[SCAN_TOPIC].messages / 10 / taken
+        return log.topics[SCAN_TOPIC].messages / 10 / wall_time
 
 
 def measure(rounds: int, peer: Path | None, folder: Path) -> Rows:
-    """All measurements, round by round."""
+    """Measure everything, round by round.
+
+    Args:
+        rounds: Number of rounds.
+        peer: The peer's program; None: it is left out.
+        folder: Where all files go.
+
+    Returns:
+        The values of each measurement.
+    """
     rows: Rows = defaultdict(list)
     scans, poses = room()
     long_log(folder / "read.mcap", 10_000, 500)
@@ -192,17 +240,17 @@ def measure(rounds: int, peer: Path | None, folder: Path) -> Rows:
 
 
 def table(rows: Rows) -> str:
-    """Medians and ratios as Markdown; of mapping, the best of all turns, ours against the peer's."""
+    """Return the medians as a Markdown table; of mapping, the best runs and their ratios to the peer's."""
     middle = {name: statistics.median(values) for name, values in rows.items()}
     ratios = {name: max(rows[name]) / max(rows["mrpt"]) for name in ("det", "prob") if "mrpt" in rows}
     middle |= {name: max(rows[name]) for name in ("det", "prob", "mrpt") if name in rows}
-    lines = ["| what | measured | beside |", "|---|---|---|"]
+    lines = ["| measurement | value | relative |", "|---|---|---|"]
     if "mrpt" in rows:
         lines.append(f"| MRPT insertObservation, one core | {middle['mrpt'] / 1e6:.2f} M rays/s | 1 |")
     for name in ("det", "prob"):
-        beside = f"{ratios[name]:.2f} x MRPT" if ratios else "–"
+        relative = f"{ratios[name]:.2f} x MRPT" if ratios else "–"
         lines.append(
-            f"| `{name}` through the public mapper, one core | {middle[name] / 1e6:.2f} M rays/s | {beside} |"
+            f"| `{name}` through the public mapper, one core | {middle[name] / 1e6:.2f} M rays/s | {relative} |"
         )
     share = statistics.median(a / b for a, b in zip(rows["help"], rows["numpy"], strict=True))
     lines += [
@@ -233,10 +281,10 @@ def main() -> None:
         if peer is None:
             print("MRPT cannot be built here (Debian: cmake g++ libmrpt-maps-dev): its rows are left out")
         rows = measure(options.rounds, peer, Path(scratch))
-    made = table(rows)
-    print(made)
+    content = table(rows)
+    print(content)
     if options.update:
-        update(options.update, "bench-speed", made)
+        update(options.update, "bench-speed", content)
 
 
 if __name__ == "__main__":

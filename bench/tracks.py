@@ -2,9 +2,9 @@
 
     python -m bench.tracks [--sessions 50] [--mapper forward] [--every 20] [--update docs/detect.md]
 
-Sessions are driven for 40 s (seeds from 70000) with exact poses and a range noise of 50 mm; the detector runs every 20
-scans. A primitive's id persists where all confirmed detections of it (outline IoU of at least 0.5) have the id of the
-first one. A false track is one that is confirmed at the end and overlaps no primitive with an IoU of 0.5.
+Sessions are driven for 40 s (seeds from 70000) with exact poses and a range noise of 50 mm; the detector runs every
+20 scans. A primitive's id persists where all confirmed detections of it (outline IoU of at least 0.5) have the id of
+the first one. A false track is one that is confirmed at the end and overlaps no primitive with an IoU of 0.5.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ class DetectionCollector(NullViewer):
 
 
 def confirmed_ids(result: DetectionResult) -> dict[int, int]:
-    """Return, by the index of each true primitive, the id of the confirmed track with an outline IoU of 0.5 or more."""
+    """Return by index of the true primitives the ids of confirmed tracks that overlap them (IoU of 0.5 or more)."""
     detected = [detection.primitive for detection in result.detections.found]
     pairs = match_primitives(detected, result.truth)
     identities = {pair.truth: result.identities[pair.detection] for pair in pairs if pair.iou >= 0.5}

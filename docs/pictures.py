@@ -1,7 +1,7 @@
-"""The picture of the mappers' maps at four noise levels: python -m docs.pictures docs/maps.png [--seed 10].
+"""The figure of all mappers' maps at four noise levels: python -m docs.pictures docs/maps.png [--seed 10].
 
-Rows: det, prob, prob with the Gaussian sensor model (told the true noise), forward. White is free, black is
-occupied, grey unknown. The same world and poses in every column.
+Rows: det, prob, prob with the Gaussian sensor model and the true noise, forward. White is free, black occupied, grey
+unknown. All columns have the same world and poses.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ GAP, LABEL = 6, 18
 
 
 def maps(seed: int) -> list[list[NDArray[np.uint8]]]:
-    """Grey images, rows of mappers, columns of noise; the largest y at the top."""
+    """Return grey images, a row for each mapper and a column for each noise level; the largest y at the top."""
     sessions = [session_of(seed, noise_std) for noise_std in NOISE]
     rows = []
     for kind in ROWS.values():
@@ -39,7 +39,7 @@ def maps(seed: int) -> list[list[NDArray[np.uint8]]]:
 
 
 def draw(rows: list[list[NDArray[np.uint8]]]) -> Image.Image:
-    """All maps side by side, labelled."""
+    """Arrange the maps side by side, with labels."""
     height, width = rows[0][0].shape
     picture = Image.new("L", (len(NOISE) * (width + GAP) + GAP, len(rows) * (height + LABEL + GAP) + GAP), 215)
     pen = ImageDraw.Draw(picture)

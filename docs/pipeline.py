@@ -1,8 +1,8 @@
-"""The whole pipeline at the paper's four noise levels (its Fig. 5): python -m docs.pipeline SUITE docs/pipeline.png.
+"""The figure of the paper's pipeline at four noise levels (Fig. 5): python -m docs.pipeline SUITE docs/pipeline.png.
 
-SUITE is the folder of ``prim-eval --suite paper``. Rows are mappers, columns noise levels as the paper's maps suggest
-(n = 0 with the networks that were trained without noise, the others with those that were trained at 0.05); the same
-world and poses everywhere. Found primitives in colour with kind and score, true ones in grey.
+SUITE is the folder of ``prim-eval --suite paper``. Rows are mappers, columns noise levels under the reading «as the
+maps suggest»: n = 0 with the networks that were trained without noise, the others with those trained at n = 0.05. The
+world and the poses are the same everywhere. Detections are in colour with kind and score, true outlines in grey.
 """
 
 from __future__ import annotations
@@ -28,13 +28,31 @@ SEED = 40_002
 
 
 def networks(suite: Path, mapper: str, noise_std: float) -> Detector:
-    """The networks that a noise level is looked at with; prob has none that were trained without noise."""
+    """Load the networks for a noise level; prob has none that were trained without noise.
+
+    Args:
+        suite: The suite's folder.
+        mapper: Name of the mapper.
+        noise_std: Standard deviation of the range noise (m).
+
+    Returns:
+        The detector.
+    """
     trained = 0 if noise_std == 0 and mapper != "prob" else 50
     return Detector.load(suite / "networks" / f"{mapper}-{trained}", mapper)
 
 
 def draw(grid: OccupancyGrid, found: tuple[Detection, ...], truth: tuple[Primitive, ...]) -> Image.Image:
-    """One map with what was found in it and what is there, the largest y at the top."""
+    """Draw a map with detections and true outlines.
+
+    Args:
+        grid: The map.
+        found: The detections.
+        truth: The true primitives.
+
+    Returns:
+        The picture, the largest y at the top.
+    """
     grey = np.flipud(np.rint(255 * (1 - grid.probability)).astype(np.uint8))
     picture = Image.fromarray(np.repeat(np.repeat(grey, SCALE, 0), SCALE, 1)).convert("RGB")
     pen = ImageDraw.Draw(picture)
@@ -47,25 +65,25 @@ def draw(grid: OccupancyGrid, found: tuple[Detection, ...], truth: tuple[Primiti
         ring = corners(primitive)
         for a, b in zip(ring, [*ring[1:], ring[0]], strict=True):
             pen.line((a, b), fill=TRUTH, width=1)
-    for one in found:
-        ring, colour = corners(one.primitive), one.primitive.kind.row.color
+    for detection in found:
+        ring, colour = corners(detection.primitive), detection.primitive.kind.row.color
         pen.line([*ring, ring[0]], fill=colour, width=2)
         x, y = min(x for x, _ in ring), min(y for _, y in ring)
-        pen.text((x, y - 12), f"{one.primitive.kind} {one.score:.2f}", fill=colour)
+        pen.text((x, y - 12), f"{detection.primitive.kind} {detection.score:.2f}", fill=colour)
     return picture
 
 
 def pictures(suite: Path) -> Image.Image:
-    """All mappers and noise levels side by side."""
+    """Arrange the pictures of all mappers and noise levels side by side."""
     rows = []
     for mapper in MAPPERS:
         row = []
         for noise_std in NOISE:
             session = session_of(SEED, noise_std)
-            made = make_mapper(mapper, 0.01, session.frame.bounds)
+            session_mapper = make_mapper(mapper, 0.01, session.frame.bounds)
             for scan, pose in session.scans:
-                made.update(scan, pose)
-            grid = made.finish()
+                session_mapper.update(scan, pose)
+            grid = session_mapper.finish()
             found = networks(suite, mapper, noise_std).detect(grid).found
             row.append(draw(grid, found, session.primitives))
         rows.append(row)

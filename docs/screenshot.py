@@ -1,8 +1,8 @@
-"""Takes a picture of a recording in the rerun viewer, without a screen: screenshot.py IN.rrd OUT.png [SHARE].
+"""A screenshot of a recording in the rerun viewer, without a display: screenshot.py IN.rrd OUT.png [SHARE].
 
-SHARE is how far into the recording to look (1 is its end). Exits with 4 where this machine cannot render (it
-needs a Vulkan driver, such as Debian's mesa-vulkan-drivers), and with 1 where a view reports that it cannot draw
-something.
+SHARE is the time to show, as a share of the recording (1, the default, is its end). Exits with 4 where this machine
+cannot render (it needs a Vulkan driver, such as Debian's mesa-vulkan-drivers), and with 1 where a view reports that
+it cannot draw something.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ SECONDS_TO_DRAW = 6
 
 
 def last_scan(recording: Path) -> int:
-    """The number of the last scan in a recording."""
+    """Return the number of the last scan in a recording."""
     last = 0
     for chunk in rr.chunk.RrdReader(recording).stream():
         batch = chunk.to_record_batch()
@@ -37,13 +37,13 @@ def last_scan(recording: Path) -> int:
 
 
 def reports(client: ViewerClient) -> list[str]:
-    """What the views say that they could not draw."""
+    """Return the views' reports of what they could not draw."""
     return [f"{view.name}: {report}" for view in client.get_state().views for report in view.reports]
 
 
 @contextmanager
-def settings_apart() -> Iterator[None]:
-    """Keeps the viewer quiet, off the network, and away from the user's own settings of it."""
+def isolated_settings() -> Iterator[None]:
+    """Run the viewer with settings of its own: no log output, no analytics, nothing of the user's configuration."""
     with tempfile.TemporaryDirectory() as folder:
         Path(folder).chmod(0o700)
         places = dict.fromkeys(("XDG_CONFIG_HOME", "XDG_DATA_HOME", "XDG_CACHE_HOME", "XDG_RUNTIME_DIR"), folder)
@@ -54,29 +54,38 @@ def settings_apart() -> Iterator[None]:
 
 
 def free_port() -> int:
-    """A port that nothing listens on."""
+    """Return a port that nothing listens on."""
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         return int(probe.getsockname()[1])
 
 
 def main(recording: Path, picture: Path, share: float) -> int:
-    """Opens the recording in a viewer without a window and saves what it shows."""
+    """Open a recording in a headless viewer and save a screenshot.
+
+    Args:
+        recording: The recording.
+        picture: The screenshot's file.
+        share: The time to show, as a share of the recording.
+
+    Returns:
+        The exit code.
+    """
     scan = round(last_scan(recording) * share)
     try:
-        with settings_apart(), ViewerClient.spawn(headless=True, port=free_port()) as client:
+        with isolated_settings(), ViewerClient.spawn(headless=True, port=free_port()) as client:
             client.open(str(recording.resolve()))
             time.sleep(2)
             client.set_time(TIMELINE, sequence=scan, play_state="paused")
             time.sleep(SECONDS_TO_DRAW)
             picture.write_bytes(client.take_screenshot())
-            complaints = reports(client)
+            problems = reports(client)
     except Exception as error:
         print(f"screenshot: cannot render here: {error}", file=sys.stderr)
         return CANNOT_RENDER
-    for complaint in complaints:
-        print(f"screenshot: {complaint}", file=sys.stderr)
-    return 1 if complaints else 0
+    for problem in problems:
+        print(f"screenshot: {problem}", file=sys.stderr)
+    return 1 if problems else 0
 
 
 if __name__ == "__main__":

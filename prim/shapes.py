@@ -181,6 +181,12 @@ class Kind(StrEnum):
         return _round_vertices(OUTLINE_POINTS) if self.is_round else np.array(self.row.outline)
 
     @cached_property
+    def reciprocals(self) -> FloatArray:
+        """One over the unit outline's vertices (N, 2): a third of a height is rounded once, as height / 3 is."""
+        with np.errstate(divide="ignore"):
+            return np.asarray(1 / self.vertices)
+
+    @cached_property
     def extent(self) -> float:
         """The larger of the unit outline's extents along x and y: how long a shape of size 1 is."""
         return 2.0 if self.is_round else float(np.ptp(self.vertices, axis=0).max())
@@ -311,8 +317,9 @@ class Primitive:
 
     def local_outline(self, points: int = OUTLINE_POINTS) -> FloatArray:
         """Return the outline's vertices (N, 2) in the shape's frame (m), counter-clockwise; round ones ``points``."""
-        vertices = _round_vertices(points) if self.is_round else self.kind.vertices
-        return np.asarray(vertices * self.width_height)
+        if self.is_round:
+            return np.asarray(_round_vertices(points) * self.width_height)
+        return np.asarray(self.width_height / self.kind.reciprocals)
 
     def outline(self, points: int = OUTLINE_POINTS) -> FloatArray:
         """Return the outline's vertices (N, 2) in the map frame (m), counter-clockwise; round ones ``points``."""
