@@ -13,6 +13,7 @@ import argparse
 import math
 import os
 import tempfile
+import textwrap
 import time
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
@@ -130,14 +131,13 @@ def fusion_table(seeds: Sequence[int], pool: ProcessPoolExecutor) -> str:
         )
     z = np.array([errors["frame"] for errors in sessions])
     bound = NORMAL_95 * math.sqrt(6 / n)
-    lines += [
-        "",
+    text = (
         f"{n} sessions. NEES is the mean normalised error squared: 3 for consistent covariances, and "
         f"{3 - bound:.2f} to {3 + bound:.2f} with 95 % probability over {n} independent sessions. The pose of the "
         f"map frame: errors over estimated standard deviations, root mean square, "
-        f"{', '.join(f'{value:.2f}' for value in np.sqrt((z**2).mean(axis=0)))} (x, y, heading).",
-    ]
-    return "\n".join(lines)
+        f"{', '.join(f'{value:.2f}' for value in np.sqrt((z**2).mean(axis=0)))} (x, y, heading)."
+    )
+    return "\n".join([*lines, "", *textwrap.wrap(text, 118)])
 
 
 def rms(values: Sequence[float]) -> float:

@@ -354,7 +354,6 @@ def require_training_extra() -> None:
 
     Raises:
         UsageError: torch or ultralytics is missing.
-
     """
     missing = [name for name in ("torch", "ultralytics") if find_spec(name) is None]
     if missing:
@@ -366,7 +365,6 @@ def parse_kinds(names: Sequence[str]) -> list[Kind]:
 
     Raises:
         UsageError: There is no kind of some name.
-
     """
     from prim.shapes import Kind
 

@@ -23,7 +23,6 @@ class Detection:
             detected the primitive.
         std: Standard deviations (m, rad) of the parameters by name; None where nothing was refined.
         kind_probabilities: Posterior probabilities of the kinds; None where nothing was refined.
-
     """
 
     primitive: Primitive
@@ -45,7 +44,6 @@ class Rejection:
         y: The same along y.
         reason: Which test it failed, in words and numbers.
         fitted: The primitive fitted to its rays; None where refinement fitted none.
-
     """
 
     kind: Kind
@@ -65,7 +63,6 @@ class Detections:
         rejected: Rejected candidates in descending order of score.
         doubtful: Candidates that were rejected for their score alone, with their rejections (which are in
             ``rejected`` too): refinement decides about them.
-
     """
 
     found: tuple[Detection, ...]

@@ -63,7 +63,6 @@ class _TileCandidates:
         tile: The tile's frame.
         grey: Its grey image (TILE_SIZE, TILE_SIZE).
         boxes: The candidates, in cells of the plane (those of the frames' rows and columns).
-
     """
 
     tile: GridFrame
@@ -84,7 +83,6 @@ class Detector:
         estimator: The networks that estimate parameters from crops.
         thresholds: Smallest score of a detection of each kind.
         options: Further parameters.
-
     """
 
     def __init__(self, yolo: Weights, networks: Sequence[Weights], options: DetectorOptions = DEFAULTS) -> None:
@@ -97,7 +95,6 @@ class Detector:
 
         Raises:
             WeightsError: A network is not what its model card says.
-
         """
         self.card = yolo.card
         self.yolo = Yolo(yolo)
@@ -120,7 +117,6 @@ class Detector:
 
         Raises:
             WeightsError: The weights cannot be used.
-
         """
         return cls(*load_weight_set(path, mapper, threads))
 
@@ -129,7 +125,6 @@ class Detector:
 
         Raises:
             UsageError: The map has another resolution than those that the networks were trained on.
-
         """
         if not np.isclose(grid.frame.resolution, self.card.resolution, rtol=1e-6):
             expected, actual = self.card.resolution, grid.frame.resolution
@@ -146,7 +141,6 @@ class Detector:
 
         Returns:
             Detections, rejected and doubtful candidates.
-
         """
         parts = list(self._candidates(images))
         boxes = Boxes.concatenate([part.boxes for part in parts])

@@ -82,7 +82,6 @@ class _Hypothesis:
         state: (K,) x, y (m), angle (rad) where the kind has one, sizes (m).
         variance: (K,) diagonal of the state's covariance (m^2, rad^2).
         score: Sum of the detections' scores.
-
     """
 
     kind: Kind
@@ -138,7 +137,6 @@ class Track:
         observations: How many detections were associated with it.
         missed: Consecutive updates without a detection.
         hypotheses: The filter of each kind that it was detected as.
-
     """
 
     id: int
@@ -189,7 +187,6 @@ class Tracker:
     Attributes:
         options: Its parameters.
         tracks: All tracks that were not deleted, tentative ones included.
-
     """
 
     def __init__(self, options: TrackerOptions = DEFAULTS) -> None:

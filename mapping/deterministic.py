@@ -31,7 +31,7 @@ class DeterministicMapper:
 
         Args:
             resolution: Side of a cell (m).
-            bounds: x0, y0, x1, y1 (m) of the map; None: it grows with the scans.
+            bounds: X0, y0, x1, y1 (m) of the map; None: it grows with the scans.
         """
         self.resolution = resolution
         self._cells = GrowingGrid(resolution, bounds, UNSEEN, np.uint8)

@@ -94,7 +94,7 @@ def make_mapper(
     Args:
         name: One of MAPPERS.
         resolution: Side of a cell (m).
-        bounds: x0, y0, x1, y1 (m) of the map; None: it grows with the scans.
+        bounds: X0, y0, x1, y1 (m) of the map; None: it grows with the scans.
         sensor_model: One of SENSOR_MODELS; other than ``eq4`` for ``prob`` alone.
         noise_std: Standard deviation of the range noise (m): ``forward`` estimates it where it is not given, the
             ``gaussian`` sensor model needs it.

@@ -22,7 +22,6 @@ def compiled(cache: bool = True, **options: Any) -> Callable[[Kernel], Kernel]:
 
     Returns:
         The decorator.
-
     """
 
     def compile_it(function: Kernel) -> Kernel:

@@ -29,7 +29,6 @@ def run(app: typer.Typer, name: str, arguments: Sequence[str]) -> int:
     Returns:
         The exit code. 0: done; 1: an input that cannot be used, or a bug; 2: usage; 3: done, but part of a log was
         lost; 130: interrupted.
-
     """
     debug = "--debug" in arguments
     gc.set_threshold(100_000, 50, 50)  # imports make many objects that stay: collecting among them takes 0.4 s
@@ -61,7 +60,6 @@ def print_error(name: str, error: PrimError, debug: bool = False) -> int:
 
     Returns:
         The exit code that goes with it.
-
     """
     if debug:
         traceback.print_exception(error)
@@ -79,7 +77,6 @@ def progress_bar(label: str, quiet: bool) -> Iterator[Callable[[int, int], None]
     Yields:
         A function that is called with how much is done and how much there is in all; None where no bar is shown:
         when quiet, or where stderr is no terminal.
-
     """
     if quiet or not sys.stderr.isatty():
         yield None

@@ -10,7 +10,6 @@ class PrimError(Exception):
 
     Attributes:
         exit_code: What a command exits with: 2 for usage, 1 for an input that cannot be used.
-
     """
 
     exit_code = 1
@@ -29,7 +28,6 @@ class LogReadError(PrimError):
         path: The log.
         what: What is wrong with it.
         hint: What to do about it; may be empty.
-
     """
 
     def __init__(self, path: str | Path, what: str, hint: str = "") -> None:

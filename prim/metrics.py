@@ -33,7 +33,6 @@ class Pair:
         width: Absolute error of the width in the paper's sense (m).
         height: Absolute error of the height in the paper's sense (m).
         iou: Intersection over union of the outlines' polygons.
-
     """
 
     detection: int
@@ -67,7 +66,6 @@ class DetectionErrors:
         height: Mean error of the height (m).
         iou: Mean intersection over union.
         pairs: All matched pairs, true positives first.
-
     """
 
     precision: float
@@ -90,7 +88,6 @@ def polygon_iou(a: Primitive, b: Primitive) -> float:
 
     Returns:
         From 0 to 1.
-
     """
     first, second, shared = polygon_areas(a, b)
     return shared / (first + second - shared)
@@ -105,7 +102,6 @@ def polygon_areas(a: Primitive, b: Primitive) -> tuple[float, float, float]:
 
     Returns:
         Area of ``a``, of ``b``, of the intersection (m^2).
-
     """
     import shapely  # here, so that a replay without detections starts faster
 
@@ -126,7 +122,6 @@ def match_primitives(detections: Sequence[Primitive], truth: Sequence[Primitive]
 
     Returns:
         The pairs in the order in which they were matched.
-
     """
     candidates = [
         pair
@@ -151,7 +146,6 @@ def detection_errors(detections: Sequence[Primitive], truth: Sequence[Primitive]
 
     Returns:
         The errors.
-
     """
     pairs = match_primitives(detections, truth)
     found = [pair for pair in pairs if pair.found]
@@ -179,7 +173,6 @@ def pose_rmse(estimate: FloatArray, truth: FloatArray) -> tuple[float, float]:
 
     Returns:
         The errors of position (m) and heading (rad).
-
     """
     delta = estimate - truth
     turn = wrap_angles(delta[:, 2])
@@ -196,7 +189,6 @@ def pose_nees(estimate: FloatArray, truth: FloatArray, covariances: FloatArray) 
 
     Returns:
         The mean; 3 is expected of consistent covariances.
-
     """
     delta = estimate - truth
     delta[:, 2] = wrap_angles(delta[:, 2])
@@ -228,7 +220,6 @@ def f1_score(precision: float, recall: float) -> float:
 
     Returns:
         F1; 0 where both are 0.
-
     """
     return 2 * precision * recall / (precision + recall) if precision + recall else 0.0
 
@@ -242,7 +233,6 @@ def ratio(part: SupportsInt, whole: SupportsInt) -> float | None:
 
     Returns:
         The ratio; None where ``whole`` is 0.
-
     """
     return int(part) / int(whole) if int(whole) else None
 

@@ -20,7 +20,6 @@ def cast_segments(origin: tuple[float, float], directions: FloatArray, segments:
 
     Returns:
         Distances (N,) in m; inf where a ray meets no segment. Segments parallel to a ray are not met.
-
     """
     if not len(segments):
         return np.full(len(directions), np.inf)
@@ -46,7 +45,6 @@ def cast_ellipses(origin: tuple[float, float], directions: FloatArray, ellipses:
 
     Returns:
         Distances (N,) in m; inf where a ray meets no ellipse. From inside an ellipse, the distance to its outline.
-
     """
     if not len(ellipses):
         return np.full(len(directions), np.inf)

@@ -58,7 +58,6 @@ class Scan:
         time_increment: From one beam to the next (s).
         scan_time: From one scan to the next (s).
         first_beam: Which beam of the sweep the first one is: not 0 in a part of a sweep.
-
     """
 
     stamp: int
@@ -107,7 +106,6 @@ class Scan:
         Returns:
             Which beams (N,) are used: all but INVALID ones, and TOO_NEAR ones only where range_min > 0 (else nothing
             can be nearer). Their ranges (M,) in m, with +inf for NO_RETURN and -inf for TOO_NEAR.
-
         """
         outcomes = self.outcomes()
         used = outcomes != _INVALID
@@ -133,7 +131,6 @@ def beam_directions(angle_min: float, angle_increment: float, count: int) -> Flo
 
     Returns:
         Unit vectors (count, 2) in the laser's frame, read-only.
-
     """
     bearings = angle_min + angle_increment * np.arange(count)
     directions = np.column_stack((np.cos(bearings), np.sin(bearings)))
@@ -150,7 +147,6 @@ class PosedScan:
         scan: The whole scan.
         pose: The laser's pose in the map frame at the first beam.
         pieces: The scan in parts, each with the laser's pose while it was taken (see :func:`deskew`).
-
     """
 
     position: int
@@ -181,7 +177,6 @@ def deskew(
     Returns:
         The pieces in the order of their beams, each with the pose at its middle beam. One piece, ``scan`` at
         ``pose``, where the motion is within the tolerance.
-
     """
     if end is None:
         return [(scan, pose)]

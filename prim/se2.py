@@ -76,7 +76,6 @@ class Trajectory:
 
     Raises:
         ValueError: The shapes do not fit, or the stamps do not rise.
-
     """
 
     stamps: Stamps
@@ -104,7 +103,6 @@ class Trajectory:
 
         Returns:
             The trajectory, of at most N poses.
-
         """
         raw_stamps = np.asarray(stamps, dtype=np.int64)
         raw_poses = np.asarray(poses, dtype=float).reshape(-1, 3)
@@ -122,7 +120,6 @@ class Trajectory:
         Returns:
             Poses (M, 3), and which stamps (M,) lie within the trajectory's time; outside of it the pose is that of
             the nearer end.
-
         """
         after = np.clip(np.searchsorted(self.stamps, stamps), 1, max(len(self) - 1, 1))
         before = after - 1
@@ -155,7 +152,6 @@ def rotate(points: ArrayLike, theta: float) -> FloatArray:
 
     Returns:
         The rotated points (N, 2), a new array.
-
     """
     cos, sin = math.cos(theta), math.sin(theta)
     rotated: FloatArray = np.asarray(points) @ np.array([[cos, sin], [-sin, cos]])
@@ -171,7 +167,6 @@ def compose_poses(poses: FloatArray, children: FloatArray) -> FloatArray:
 
     Returns:
         The children's poses (N, 3) in the parent of ``poses``.
-
     """
     cos, sin = np.cos(poses[:, 2]), np.sin(poses[:, 2])
     x = poses[:, 0] + cos * children[:, 0] - sin * children[:, 1]
@@ -188,7 +183,6 @@ def relative_poses(poses: FloatArray, others: FloatArray) -> FloatArray:
 
     Returns:
         ``others`` (N, 3) in the frames of ``poses``.
-
     """
     change = others - poses
     cos, sin = np.cos(poses[:, 2]), np.sin(poses[:, 2])
@@ -212,7 +206,6 @@ def integrate_steps(steps: FloatArray, start: FloatArray | None = None) -> Float
 
     Returns:
         The poses (N, 3) after each step, with headings that are not wrapped.
-
     """
     x, y, theta = np.zeros(3) if start is None else start
     heading = theta + np.cumsum(steps[:, 2])
@@ -232,7 +225,6 @@ def compose_covariances(covariances: FloatArray, poses: FloatArray, children: Fl
 
     Returns:
         The covariances (N, 3, 3) of ``compose_poses(poses, children)``.
-
     """
     cos, sin = np.cos(poses[:, 2]), np.sin(poses[:, 2])
     jacobian = np.broadcast_to(np.eye(3), (len(poses), 3, 3)).copy()
@@ -251,7 +243,6 @@ def frame_covariances(covariance: FloatArray, poses: FloatArray) -> FloatArray:
 
     Returns:
         The covariances (N, 3, 3) of the poses that come of the frame's error alone.
-
     """
     jacobian = np.broadcast_to(np.eye(3), (len(poses), 3, 3)).copy()
     jacobian[:, 0, 2], jacobian[:, 1, 2] = -poses[:, 1], poses[:, 0]

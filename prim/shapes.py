@@ -48,9 +48,9 @@ def uniform(sizes: int, low: float, high: float) -> Draw:
     """Make a draw of independent sizes from one uniform distribution.
 
     Args:
-        sizes: how many.
-        low: smallest size (m).
-        high: largest size (m).
+        sizes: How many.
+        low: Smallest size (m).
+        high: Largest size (m).
 
     Returns:
         The draw.
@@ -62,9 +62,9 @@ def isosceles(low: float, high: float, min_height: float) -> Draw:
     """Make a draw of base and height of an isosceles triangle, whose base and legs are uniform.
 
     Args:
-        low: shortest base or leg (m).
-        high: longest one (m).
-        min_height: both are drawn again until the triangle is this high (m).
+        low: Shortest base or leg (m).
+        high: Longest one (m).
+        min_height: Both are drawn again until the triangle is this high (m).
 
     Returns:
         The draw.
@@ -97,14 +97,13 @@ class Row:
     """What a kind is.
 
     Attributes:
-        sizes: the sizes' names, in the order of :attr:`Primitive.size`. A single one is tied: it is both the width
+        sizes: The sizes' names, in the order of :attr:`Primitive.size`. A single one is tied: it is both the width
             and the height that the unit outline is stretched by.
-        outline: the unit outline, counter-clockwise about its centroid: a convex polygon, or DISC.
-        period: the turn (rad) after which theta is the same again; None where the kind has no angle.
-        regular_period: the same where the outline's sides (a disc's axes) agree within SIDES_AGREE.
-        draw: draws sizes (m) as the recorder wants them: the paper's ranges.
-        color: red, green, blue (0 to 255).
-
+        outline: The unit outline, counter-clockwise about its centroid: a convex polygon, or DISC.
+        period: The turn (rad) after which theta is the same again; None where the kind has no angle.
+        regular_period: The same where the outline's sides (a disc's axes) agree within SIDES_AGREE.
+        draw: Draws sizes (m) as the recorder wants them: the paper's ranges.
+        color: Red, green, blue (0 to 255).
     """
 
     sizes: tuple[str, ...]
@@ -235,7 +234,6 @@ class Primitive:
 
     Raises:
         ValueError: The sizes or the heading do not fit the kind, or a value is not finite, or a size not positive.
-
     """
 
     kind: Kind
@@ -342,7 +340,6 @@ class Primitive:
 
         Returns:
             Distances (N,) in m; inf where a ray misses. From inside the shape, the distance to its outline.
-
         """
         if self.is_round:
             return cast_ellipses(origin, directions, np.array([self.as_ellipse()]))
@@ -385,9 +382,9 @@ def angle_difference(a: float, b: float, period: float = 2 * math.pi) -> float:
     """Subtract angles modulo a period.
 
     Args:
-        a: an angle (rad).
-        b: what is subtracted (rad).
-        period: the period (rad).
+        a: An angle (rad).
+        b: What is subtracted (rad).
+        period: The period (rad).
 
     Returns:
         a - b in [-period/2, period/2).
@@ -399,8 +396,8 @@ def angle_error(estimate: Primitive, truth: Primitive) -> float | None:
     """Compute the error in angle modulo the true shape's own symmetry.
 
     Args:
-        estimate: the estimate.
-        truth: the true primitive.
+        estimate: The estimate.
+        truth: The true primitive.
 
     Returns:
         Radians, 0 or more; None where either has no angle.

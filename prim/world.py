@@ -32,7 +32,6 @@ class World:
         size: The floor, along x and y (m), centred on the origin.
         primitives: The primitives.
         walls: The walls.
-
     """
 
     size: tuple[float, float]
@@ -59,7 +58,6 @@ class World:
 
         Returns:
             Distances (N,) in m; inf where there is no surface.
-
         """
         flat = cast_segments(origin, directions, self._segments)
         return np.minimum(flat, cast_ellipses(origin, directions, self._ellipses))

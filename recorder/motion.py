@@ -26,7 +26,6 @@ class Step:
         pose: The robot's true pose.
         world: The world as it is then.
         travelled: How far a wheel has rolled since the step before (m).
-
     """
 
     pose: Pose2D
@@ -50,7 +49,6 @@ class ExplorerOptions:
         patience: Decisions without progress after which the robot backs off and plans anew.
         back_off_decisions: Decisions for which it backs off.
         back_off_ratio: The right wheel's speed over the left one's while it backs off.
-
     """
 
     cell: float = 0.05
@@ -79,7 +77,6 @@ def warp(simulator: Simulator, rng: np.random.Generator, stops: tuple[int, int] 
 
     Yields:
         A step for each place, row by row; places where the robot would touch a primitive are left out.
-
     """
     x0, y0, x1, y1 = simulator.world.bounds
     cols, rows = stops
@@ -117,7 +114,6 @@ def drive(
 
     Raises:
         UsageError: The robot has no room to stand.
-
     """
     explorer = Explorer(simulator, rng, options)
     pose = explorer.start()
@@ -144,7 +140,6 @@ class Explorer:
         simulator: The world and the robot.
         rng: Draws the start and the goals.
         options: How it explores.
-
     """
 
     def __init__(self, simulator: Simulator, rng: np.random.Generator, options: ExplorerOptions = DEFAULTS) -> None:
@@ -162,7 +157,6 @@ class Explorer:
 
         Raises:
             UsageError: There is no such place.
-
         """
         self._free = _largest_component(self._free)
         if not self._free:
@@ -183,7 +177,6 @@ class Explorer:
 
         Returns:
             Rim speeds (m/s) of the left and the right wheel.
-
         """
         options = self._options
         self._unexplored -= self._around(pose)

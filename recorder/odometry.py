@@ -17,7 +17,6 @@ class OdometryNoise:
     Attributes:
         translation_std: Standard deviation of the position, along and across alike, after one metre (m).
         rotation_std: Standard deviation of the heading after one metre (rad).
-
     """
 
     translation_std: float = 0.05
@@ -30,7 +29,6 @@ class Odometry:
     Args:
         noise: The noise of a step.
         rng: Draws it.
-
     """
 
     def __init__(self, noise: OdometryNoise, rng: np.random.Generator) -> None:
@@ -48,7 +46,6 @@ class Odometry:
 
         Returns:
             The pose by odometry, with the covariance of its error.
-
         """
         if self._true is None:
             self.pose = Pose2D(true_pose.x, true_pose.y, true_pose.theta, np.zeros((3, 3)))

@@ -26,7 +26,6 @@ class Lidar:
         range_min: The shortest range that is measured (m).
         range_max: The longest one (m).
         noise_std: Standard deviation of the Gaussian noise on each range (m).
-
     """
 
     rays: int = 500
@@ -49,7 +48,6 @@ class Lidar:
 
         Returns:
             Ranges (rays,) in m; inf beyond ``range_max``.
-
         """
         beams = beam_directions(-self.fov / 2, self.angle_increment, self.rays)
         distances = world.cast((pose.x, pose.y), rotate(beams, pose.theta))
@@ -67,7 +65,6 @@ class Lidar:
 
         Returns:
             The scan.
-
         """
         ranges = self.exact(world, pose) + self.noise_std * rng.standard_normal(self.rays)
         ranges[ranges < self.range_min] = -np.inf
@@ -90,7 +87,6 @@ class Gps:
 
     Attributes:
         noise_std: Standard deviation of the Gaussian noise on x and on y (m).
-
     """
 
     noise_std: float = 0.1
@@ -104,7 +100,6 @@ class Gps:
 
         Returns:
             x, y (m).
-
         """
         dx, dy = self.noise_std * rng.standard_normal(2)
         return pose.x + dx, pose.y + dy
@@ -116,7 +111,6 @@ class Compass:
 
     Attributes:
         noise_std: Standard deviation of the Gaussian noise (rad).
-
     """
 
     noise_std: float = math.radians(3)
@@ -130,6 +124,5 @@ class Compass:
 
         Returns:
             The heading (rad).
-
         """
         return pose.theta + self.noise_std * rng.standard_normal()

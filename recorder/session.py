@@ -87,7 +87,6 @@ class SessionOptions:
         simulator: Robot and physics.
         explorer: How a driving robot explores.
         placement: How the primitives of a drawn world are placed.
-
     """
 
     seed: int = 0
@@ -118,7 +117,6 @@ class Session:
         scans: The number of scans.
         skipped: The number of stops where the robot would touch something, and was not put.
         duration: From the first scan to the last (s).
-
     """
 
     path: Path
@@ -159,7 +157,6 @@ def record_session(path: Path, options: SessionOptions) -> Session:
         UsageError: The primitives do not fit on the floor, or the robot has no place to stand.
         WorldError: The world's file is no world.
         OutputError: The log cannot be written.
-
     """
     generators = _Generators.from_seed(options.seed)
     if options.world_file:

@@ -24,7 +24,7 @@ class SimulatorOptions:
     Attributes:
         robot_radius: Radius of the robot's body (m); the e-puck's, by its data sheet.
         axle: Distance between the wheels (m); the e-puck's, by its data sheet.
-        robot_mass: kg; about the e-puck's.
+        robot_mass: Kg; about the e-puck's.
         primitive_density: Mass of movable primitives (kg/m^2); hollow boxes that the robot can push, set by hand.
         gravity: m/s^2; standard gravity.
         tyre_friction: Coulomb coefficient between tyres and floor; rubber on wood, set by hand.
@@ -38,7 +38,6 @@ class SimulatorOptions:
         min_shift: A primitive that was shifted by less has not moved (m), set by hand.
         min_turn: A primitive that was turned by less has not moved (rad), set by hand.
         outline_points: Vertices that stand for a curved outline that can turn, set by hand.
-
     """
 
     robot_radius: float = 0.035
@@ -68,7 +67,6 @@ class Simulator:
         world: The primitives and walls at the start.
         movable: Whether the robot can push the primitives.
         options: The physics.
-
     """
 
     def __init__(self, world: World, movable: bool = False, options: SimulatorOptions = DEFAULTS) -> None:
@@ -106,7 +104,6 @@ class Simulator:
 
         Returns:
             The distance (m), negative inside a thing, at most ``reach``.
-
         """
         found = self._space.point_query((x, y), reach, pymunk.ShapeFilter())
         return min((hit.distance for hit in found if _is_static(hit.shape)), default=reach)
@@ -124,7 +121,6 @@ class Simulator:
             left: Rim speed of the left wheel (m/s).
             right: Rim speed of the right wheel (m/s).
             seconds: For how long; rounded to whole steps of the simulation.
-
         """
         if self._disc not in self._space.shapes:
             self._space.add(self._robot, self._disc)

@@ -24,7 +24,6 @@ class WorldOptions:
         kinds: The kinds of primitives that are drawn.
         per_kind: Fewest and most primitives of each kind.
         walls: Whether there is a wall along each edge of the floor.
-
     """
 
     size: tuple[float, float] = (2.0, 2.0)
@@ -41,7 +40,6 @@ class PlacementOptions:
         gap: Least distance of primitives from each other and from the floor's edge (m).
         tries_per_primitive: Places that are tried for one primitive before the world is drawn anew.
         tries: Places that are tried in all.
-
     """
 
     gap: float = 0.03
@@ -65,7 +63,6 @@ def draw_world(rng: np.random.Generator, options: WorldOptions, placement: Place
 
     Raises:
         UsageError: The primitives do not fit on the floor.
-
     """
     tries = iter(range(placement.tries))
     while True:
@@ -118,7 +115,6 @@ def draw_primitive(rng: np.random.Generator, kind: Kind, size: tuple[float, floa
 
     Returns:
         The primitive, its centroid on the floor.
-
     """
     lengths = kind.row.draw(rng)
     theta = rng.uniform(0, 2 * math.pi) if kind.has_angle else None

@@ -24,7 +24,6 @@ class BoxMetrics:
         map50_95: Its mean over MATCH_IOUS.
         auc: Area under the precision-recall curve at a match IoU of 0.5, without interpolation.
         confidence: Score threshold of the largest F1.
-
     """
 
     f1: float
@@ -57,7 +56,6 @@ def average_precision(matches: KindMatches, column: int) -> float:
 
     Returns:
         The average precision, 0 to 1.
-
     """
     precision, recall = matches.precision_recall(column)
     envelope = np.maximum.accumulate(precision[::-1])[::-1]

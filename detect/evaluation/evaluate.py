@@ -61,7 +61,6 @@ class ParameterErrors:
         height: Height (m), likewise.
         size: Sizes, as a share of the true ones.
         position: Centroid (m).
-
     """
 
     count: int
@@ -89,7 +88,6 @@ class Evaluation:
         yolo_time: Mean time (s) of YOLO for one image; images are processed one after the other.
         parameters_time: The same of the parameter networks.
         whole_time: The same of the whole pipeline.
-
     """
 
     images: int
@@ -117,7 +115,6 @@ def evaluate_detector(detector: Detector, samples: Sequence[Sample], progress: P
 
     Returns:
         The results.
-
     """
     scored: list[ScoredBoxes] = []
     at_true_boxes: list[PrimitivePair] = []
@@ -166,7 +163,6 @@ def scored_candidates(
 
     Returns:
         Candidates and true boxes of each image.
-
     """
     stacked = np.stack([labelled.image for labelled in images])
     candidates = yolo(stacked, options.score_floor, multi_label=True)
@@ -185,7 +181,6 @@ def best_candidates(boxes: Boxes, options: EvaluationOptions = DEFAULTS) -> Boxe
 
     Returns:
         The remaining candidates in descending order of score.
-
     """
     suppressor = non_maximum_suppression(boxes, options.nms_iou, per_kind=True)
     kept = np.flatnonzero(suppressor == np.arange(len(boxes)))
@@ -221,7 +216,6 @@ def matched_pairs(found: Sequence[Primitive], truth: Sequence[Primitive]) -> lis
 
     Returns:
         The pairs that count as found: kind right, polygon IoU at least 0.5.
-
     """
     pairs = match_primitives(found, truth)
     return [(found[pair.detection], truth[pair.truth]) for pair in pairs if pair.found]
@@ -237,7 +231,6 @@ def precision_recall_f1(hits: int, detections: int, truths: int) -> tuple[float,
 
     Returns:
         The three, 0 where there is nothing to divide by.
-
     """
     return hits / max(detections, 1), hits / max(truths, 1), 2 * hits / max(detections + truths, 1)
 

@@ -13,7 +13,6 @@ class PaperRow:
         train: Noise level n of the training maps.
         test: Noise level n of the test maps.
         mapper: Name of the mapper.
-
     """
 
     train: float

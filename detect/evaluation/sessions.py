@@ -62,7 +62,6 @@ class SessionScore:
         pairs: Detections that count as found, each with its true primitive.
         detections: Number of all detections.
         truths: Number of all true primitives.
-
     """
 
     scored: tuple[ScoredBoxes, ...]
@@ -83,7 +82,6 @@ class SessionScore:
 
         Returns:
             The comparison.
-
         """
         found = [detection.primitive for detection in detections]
         return cls(tuple(scored), tuple(matched_pairs(found, truth)), len(found), len(truth))
@@ -102,7 +100,6 @@ def evaluate_session(
 
     Returns:
         The score of the networks alone, and that after refinement.
-
     """
     world, scans = simulate_session(session_options(options, seed))
     frame = map_frame(world, options.resolution)
@@ -135,7 +132,6 @@ def evaluate_sessions(seeds: Sequence[int], options: DatasetOptions, mapper: str
 
     Returns:
         Results as they are stored: ``networks`` (alone) and ``refined``, each as :func:`summarize_sessions`.
-
     """
     evaluate = partial(evaluate_session, options=options, mapper=mapper, weights=weights)
     with ProcessPoolExecutor(cores()) as pool:
@@ -173,7 +169,6 @@ def scored_primitives(refined: Detections, truth: Sequence[Primitive]) -> Scored
 
     Returns:
         Candidates and true boxes, in cells of 10 mm.
-
     """
     rejected = [rejection.fitted for rejection in refined.rejected if rejection.fitted is not None]
     candidates = [

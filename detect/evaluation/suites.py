@@ -62,7 +62,6 @@ class Case:
         row: The row.
         train_mm: Standard deviation (mm) of the noise of training maps.
         test_mm: The same of test maps.
-
     """
 
     reading: str
@@ -104,7 +103,6 @@ class PaperSuite:
     Attributes:
         work: The folder.
         announce: Called with lines of progress.
-
     """
 
     def __init__(self, work: Path, announce: Announce) -> None:
@@ -115,7 +113,6 @@ class PaperSuite:
 
         Raises:
             UsageError: There are none.
-
         """
         found: list[PaperResult] = []
         for case in cases():
@@ -135,7 +132,6 @@ class PaperSuite:
 
         Raises:
             PrimError: The folder cannot be used.
-
         """
         found: list[PaperResult] = []
         for case in cases():
@@ -152,7 +148,6 @@ class PaperSuite:
 
         Returns:
             The evaluation, as JSON.
-
         """
         path = self.result_path(case, test_set)
         stored = read_result(path)
@@ -170,7 +165,6 @@ class PaperSuite:
 
         Returns:
             Its path.
-
         """
         return self.work / "results" / f"{case.network}.{test_set}.json"
 
@@ -208,7 +202,6 @@ class RecordingCondition:
         name: One of RecordingMode.
         noise_mm: Standard deviation of the range noise (mm).
         options: How sessions are recorded.
-
     """
 
     name: str
@@ -249,7 +242,6 @@ class ShippedSuite:
         work: The folder of the results.
         weights: The weights, one folder for each mapper.
         announce: Called with lines of progress.
-
     """
 
     def __init__(self, work: Path, weights: Path, announce: Announce) -> None:
@@ -269,7 +261,6 @@ class ShippedSuite:
         Raises:
             UsageError: The folder holds no weights.
             OutputError: A result cannot be written.
-
         """
         available = [mapper for mapper in mappers if (self.weights / mapper / DETECTOR_FILE).exists()]
         if not available:
@@ -296,7 +287,6 @@ class ShippedSuite:
 
         Raises:
             UsageError: There are none.
-
         """
         found = []
         for condition in conditions(1):
@@ -327,7 +317,6 @@ def evaluate_networks(path: Path, networks: Path, mapper: str, data: Callable[[]
 
     Returns:
         The evaluation, as JSON.
-
     """
     if not path.exists() or path.stat().st_mtime < (networks / DETECTOR_FILE).stat().st_mtime:
         detector = Detector.load(networks, mapper)
@@ -357,7 +346,6 @@ def write_text(path: Path, text: str) -> None:
 
     Raises:
         OutputError: It cannot be written.
-
     """
     part = path.with_name(path.name + ".part")
     try:

@@ -67,7 +67,6 @@ def write_paper_report(results: Sequence[PaperResult], folder: Path) -> list[Pat
 
     Raises:
         OutputError: A file cannot be written.
-
     """
     markdown, table, plot = (folder / f"paper.{ending}" for ending in ("md", "csv", "png"))
     folder.mkdir(parents=True, exist_ok=True)
@@ -284,7 +283,6 @@ def write_shipped_report(results: Sequence[ShippedResult], folder: Path) -> list
 
     Raises:
         OutputError: A file cannot be written.
-
     """
     folder.mkdir(parents=True, exist_ok=True)
     markdown, table = folder / "shipped.md", folder / "shipped.csv"

@@ -23,7 +23,6 @@ class BoxedKind:
         tile: The tile's frame.
         box: The box, in cells of the tile.
         kind: The kind.
-
     """
 
     grey: NDArray[np.uint8]
@@ -40,7 +39,6 @@ class ParameterEstimator:
 
         Raises:
             WeightsError: A network does not take the crops that its card names, or has another number of outputs.
-
         """
         self._networks = [_Network(weights) for weights in networks]
         self._network_of = {kind: network for network in self._networks for kind in network.kinds}
@@ -54,7 +52,6 @@ class ParameterEstimator:
 
         Raises:
             WeightsError: A network gives outputs that are not finite.
-
         """
         primitives: dict[int, Primitive] = {}
         for network in self._networks:

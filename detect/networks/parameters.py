@@ -51,7 +51,6 @@ class Preset:
         isolated: Whether all but the box is blanked out as unknown.
         angle_as_vector: Whether the angle is encoded as cosine and sine.
         has_offset: Whether the centroid's offset from the window's centre is encoded.
-
     """
 
     name: str
@@ -86,7 +85,6 @@ class Preset:
 
         Returns:
             The slice of the outputs.
-
         """
         first = sum(self.output_count(other) for other in kinds[: kinds.index(kind)])
         return slice(first, first + self.output_count(kind))
@@ -105,7 +103,6 @@ class Preset:
 
         Returns:
             x and y (m), map frame.
-
         """
         col, row = self.window_origin(box)
         half = self.window / 2
@@ -127,7 +124,6 @@ def crop_box(image: NDArray[np.uint8], box: Box, preset: Preset) -> NDArray[np.u
 
     Returns:
         The crop (pixels, pixels).
-
     """
     rows, cols = image.shape
     left, top, right, bottom = box
@@ -154,7 +150,6 @@ def downsample(window: NDArray[np.uint8], pixels: int) -> NDArray[np.uint8]:
 
     Returns:
         The image (pixels, pixels); each pixel is the mean of its block, rounded.
-
     """
     factor = len(window) // pixels
     if factor == 1:
@@ -196,7 +191,6 @@ def encode_parameters(primitive: Primitive, preset: Preset) -> NDArray[np.float3
 
     Returns:
         The outputs (M,) that a network should give.
-
     """
     values: list[float] = []
     order = symmetry_order(primitive.kind)
@@ -228,7 +222,6 @@ def decode_parameters(kind: Kind, outputs: Sequence[float], preset: Preset, box:
 
     Returns:
         The primitive in the map frame, its sizes at least MIN_SIZE.
-
     """
     first = preset.angle_outputs(kind)
     order = symmetry_order(kind)

@@ -46,7 +46,6 @@ def crop_to_tile(grid: OccupancyGrid, tile: GridFrame) -> OccupancyGrid | None:
 
     Returns:
         The part, which shares the map's memory; None where they do not intersect.
-
     """
     frame = grid.frame
     row, col = max(tile.row, frame.row), max(tile.col, frame.col)
@@ -69,7 +68,6 @@ def tile_image(grid: OccupancyGrid, tile: GridFrame, style: str = "grey") -> NDA
 
     Returns:
         The image (rows, cols, 3), row 0 at the smallest y.
-
     """
     image = np.zeros((tile.rows, tile.cols, 3), np.uint8)
     image[..., slice(0, 1) if style == "grey" else slice(None)] = UNKNOWN_GREY

@@ -49,7 +49,6 @@ class ModelCard:
         resolution: Side of the maps' cells (m).
         thresholds: Of a yolo, the smallest score of a detection by kind.
         about: Data, options and metrics of the training.
-
     """
 
     stage: str
@@ -72,7 +71,6 @@ class ModelCard:
 
         Raises:
             ValueError: The text is no model card of this schema, or has unknown fields or impossible values.
-
         """
         value = json.loads(text)
         if not isinstance(value, dict) or value.pop("schema", None) != SCHEMA:
@@ -104,7 +102,6 @@ class Weights:
         path: Its file.
         card: Its model card.
         session: ONNX Runtime's session.
-
     """
 
     path: Path
@@ -126,7 +123,6 @@ def load_weights(path: Path, stage: str, mapper: str | None = None, threads: int
 
     Raises:
         WeightsError: The file is missing, damaged, a pickle, without a model card, or for something else.
-
     """
     import onnxruntime
 
@@ -173,7 +169,6 @@ def load_weight_set(
     Raises:
         WeightsError: As :func:`load_weights`; or a kind has no parameter network or several, or the networks were
             trained on images of another style or resolution than YOLO.
-
     """
     detector = path / DETECTOR_FILE if path.is_dir() else path
     yolo = load_weights(detector, "yolo", mapper, threads)

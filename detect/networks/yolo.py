@@ -29,7 +29,6 @@ class Boxes:
         box: (N, 4) left, top, right, bottom in cells.
         kind: (N,) class indices (of KINDS).
         score: (N,) class scores, 0 to 1.
-
     """
 
     box: BoxArray
@@ -51,7 +50,6 @@ class Boxes:
 
         Returns:
             Candidates of the same kinds and scores.
-
         """
         return Boxes(self.box + np.array([cols, rows, cols, rows], np.float32), self.kind, self.score)
 
@@ -69,7 +67,6 @@ class Yolo:
 
     Attributes:
         weights: The network and its model card.
-
     """
 
     def __init__(self, weights: Weights) -> None:
@@ -77,7 +74,6 @@ class Yolo:
 
         Raises:
             WeightsError: The network does not take tiles, or does not give boxes of the kinds of its card.
-
         """
         self.weights = weights
         self._input = weights.session.get_inputs()[0].name
@@ -101,7 +97,6 @@ class Yolo:
 
         Raises:
             WeightsError: The network does not take the images.
-
         """
         scaled = np.ascontiguousarray(images.transpose(0, 3, 1, 2), dtype=np.float32) / np.float32(255)
         return [_decode_anchors(output, self._kinds, score_floor, multi_label) for output in self._run(scaled)]
@@ -139,7 +134,6 @@ def box_iou(box: BoxArray, others: BoxArray) -> NDArray[np.float32]:
 
     Returns:
         (N,), 0 to 1.
-
     """
     low, high = np.maximum(box[:2], others[:, :2]), np.minimum(box[2:], others[:, 2:])
     shared = np.clip(high - low, 0, None).prod(axis=1)
@@ -167,7 +161,6 @@ def non_maximum_suppression(
     Returns:
         (N,) for each candidate the index of the one that suppresses it, its own where it stays, -1 where it is not
         eligible.
-
     """
     suppressor = np.full(len(boxes), -1, np.intp)
     order = np.argsort(-boxes.score, kind="stable")

@@ -35,17 +35,17 @@ class Candidate:
     """One thing that is fitted.
 
     Attributes:
-        start: the guess.
-        bundle: the rays around it.
-        cells: the map.
-        known: a detection of an earlier pass whose kind is not asked again.
-        options: the numbers of refinement.
-        background: what stands behind it in the map.
-        walls: straight walls near it.
-        fits: the fits, likeliest kind first.
-        fitted_to: the sensor and the rays, with their background, of these fits.
-        is_rough: whether they were made to some of the rays only.
-        current: the primitive as far as it is known.
+        start: The guess.
+        bundle: The rays around it.
+        cells: The map.
+        known: A detection of an earlier pass whose kind is not asked again.
+        options: The numbers of refinement.
+        background: What stands behind it in the map.
+        walls: Straight walls near it.
+        fits: The fits, likeliest kind first.
+        fitted_to: The sensor and the rays, with their background, of these fits.
+        is_rough: Whether they were made to some of the rays only.
+        current: The primitive as far as it is known.
     """
 
     start: Primitive
@@ -68,8 +68,8 @@ class Candidate:
         """Set what its rays measure where they miss it: the map, walls and other candidates.
 
         Args:
-            others: all candidates; those far away, and itself, are passed over.
-            sensor: the sensor.
+            others: All candidates; those far away, and itself, are passed over.
+            sensor: The sensor.
 
         Returns:
             Its rays.
@@ -113,9 +113,9 @@ class Candidate:
         """Take fits for what is known of it.
 
         Args:
-            fits: the fits, the likeliest kind first.
-            bundle: the rays that they were made to.
-            sensor: the sensor that they were made with.
+            fits: The fits, the likeliest kind first.
+            bundle: The rays that they were made to.
+            sensor: The sensor that they were made with.
         """
         self.fits, self.fitted_to = fits, (sensor, bundle)
         self.current = primitive_of(fits[0].kind, fits[0].p)
@@ -129,10 +129,10 @@ def fit_candidates(
     A candidate whose background and occlusion have hardly changed stays as it is.
 
     Args:
-        pool: the threads.
-        candidates: the candidates.
-        search: for each whether all kinds are fitted from new starts, or from the fits that there are.
-        sensor: the sensor.
+        pool: The threads.
+        candidates: The candidates.
+        search: For each whether all kinds are fitted from new starts, or from the fits that there are.
+        sensor: The sensor.
     """
     bundles = [candidate.rays_with_background(candidates, sensor) for candidate in candidates]
     work = zip(candidates, bundles, search, strict=True)
@@ -175,10 +175,10 @@ def find_backgrounds(pool: Executor, candidates: Sequence[Candidate], cells: Map
     """Read from the map what stands behind each candidate: the map without the candidates' own cells.
 
     Args:
-        pool: the threads.
-        candidates: the candidates; their background and walls are set.
-        cells: the map.
-        margin: cells this near (m) to a candidate are its own.
+        pool: The threads.
+        candidates: The candidates; their background and walls are set.
+        cells: The map.
+        margin: Cells this near (m) to a candidate are its own.
 
     Returns:
         For each candidate whether its background has changed much.
@@ -208,8 +208,8 @@ def centroid_distance(a: Primitive, b: Primitive) -> float:
     """Return the distance (m) of two primitives' centroids.
 
     Args:
-        a: one.
-        b: the other.
+        a: One.
+        b: The other.
 
     Returns:
         Metres.
@@ -221,8 +221,8 @@ def shared_area(a: Primitive, b: Primitive) -> float:
     """Return the area that two primitives share, as a fraction of the smaller one's.
 
     Args:
-        a: one.
-        b: the other.
+        a: One.
+        b: The other.
 
     Returns:
         0 to 1.

@@ -42,8 +42,8 @@ def max_size(kind: Kind, options: EvidenceOptions = DEFAULTS.evidence) -> float:
     """Return the upper bound (m) of a kind's sizes under the prior.
 
     Args:
-        kind: the kind.
-        options: the largest extent.
+        kind: The kind.
+        options: The largest extent.
 
     Returns:
         The bound (m): half the extent for radii and semi-axes.
@@ -58,8 +58,8 @@ def log_prior(kind: Kind, options: EvidenceOptions = DEFAULTS.evidence) -> float
     definition, each shape has two names in the parameters' full range, of which one is found.
 
     Args:
-        kind: the kind.
-        options: the largest extent.
+        kind: The kind.
+        options: The largest extent.
 
     Returns:
         Nats (for metres and radians).
@@ -73,9 +73,9 @@ def laplace_evidence(fit: KindFit, dispersion: float = 1.0, options: EvidenceOpt
     """Approximate a fit's log evidence by Laplace's method.
 
     Args:
-        fit: the maximum-likelihood fit.
-        dispersion: by which the log-likelihood is divided (quasi-likelihood; McCullagh and Nelder 1989).
-        options: the prior.
+        fit: The maximum-likelihood fit.
+        dispersion: By which the log-likelihood is divided (quasi-likelihood; McCullagh and Nelder 1989).
+        options: The prior.
 
     Returns:
         Nats.
@@ -93,8 +93,8 @@ class KindPosterior:
     Attributes:
         mean: (K,).
         covariance: (K, K).
-        log_evidence: nats.
-        cost: negative log-likelihood at the mean (nats).
+        log_evidence: Nats.
+        cost: Negative log-likelihood at the mean (nats).
         effective_samples: Kish's effective sample size.
     """
 
@@ -111,10 +111,10 @@ def importance_sample(
     """Compute a kind's posterior and evidence by adaptive importance sampling, each round drawn from the last one's.
 
     Args:
-        fit: the maximum-likelihood fit.
-        bundle: the rays.
-        sensor: the sensor.
-        options: the prior and the sampler's numbers.
+        fit: The maximum-likelihood fit.
+        bundle: The rays.
+        sensor: The sensor.
+        options: The prior and the sampler's numbers.
 
     Returns:
         The posterior; its log evidence is -inf where no sample is a shape that the prior allows.
@@ -181,11 +181,11 @@ class SplitCost:
         """Split rays by whether they hit all shapes within a standard deviation of the fit.
 
         Args:
-            fit: the fit.
+            fit: The fit.
             covariance: (5, 5) of the shapes' parameters around it.
-            bundle: the rays.
-            sensor: the sensor.
-            options: the prior's bounds.
+            bundle: The rays.
+            sensor: The sensor.
+            options: The prior's bounds.
 
         Returns:
             The cost.
@@ -255,11 +255,11 @@ def exact_costs(
     """Compute the exact negative log-likelihoods of shapes.
 
     Args:
-        kind: their kind.
+        kind: Their kind.
         shapes: (M, 5) parameters.
-        bundle: the rays.
-        sensor: the sensor.
-        options: the prior's bounds.
+        bundle: The rays.
+        sensor: The sensor.
+        options: The prior's bounds.
 
     Returns:
         (M,) in nats; infinite where a size is out of the prior's bounds.
@@ -278,11 +278,11 @@ class Posterior:
     """The posterior over kinds and the likeliest kind's parameters.
 
     Attributes:
-        primitive: the likeliest kind at its posterior mean.
-        std: standard deviations (m, rad) by parameter name.
+        primitive: The likeliest kind at its posterior mean.
+        std: Standard deviations (m, rad) by parameter name.
         covariance: (K, K) in the same order.
-        chances: posterior probabilities of all kinds; they sum to 1.
-        cost: negative log-likelihood of the primitive (nats).
+        chances: Posterior probabilities of all kinds; they sum to 1.
+        cost: Negative log-likelihood of the primitive (nats).
     """
 
     primitive: Primitive
@@ -302,11 +302,11 @@ def compare_kinds(
     """Compare fits of several kinds to the same rays by their evidence, all kinds being equally likely a priori.
 
     Args:
-        fits: one fit for each kind.
-        bundle: the rays.
-        sensor: the sensor.
-        is_possible: whether a primitive may be there at all; kinds whose posterior mean may not are left out.
-        options: the prior and the sampler's numbers.
+        fits: One fit for each kind.
+        bundle: The rays.
+        sensor: The sensor.
+        is_possible: Whether a primitive may be there at all; kinds whose posterior mean may not are left out.
+        options: The prior and the sampler's numbers.
 
     Returns:
         The posterior, or None where no kind is left, or all are larger than the prior allows.
@@ -361,8 +361,8 @@ def summarize(kind: Kind, posterior: KindPosterior) -> tuple[Primitive, dict[str
     """Express a posterior in a primitive's canonical parameters.
 
     Args:
-        kind: the kind.
-        posterior: its posterior.
+        kind: The kind.
+        posterior: Its posterior.
 
     Returns:
         The primitive at the mean, standard deviations (m, rad) by name, and the covariance (K, K) in their order.

@@ -30,9 +30,9 @@ class KindFit:
     """A kind fitted to rays.
 
     Attributes:
-        kind: the kind.
+        kind: The kind.
         p: (5,) the maximum-likelihood parameters x, y (m), theta (rad), width, height (m).
-        cost: negative log-likelihood there (nats).
+        cost: Negative log-likelihood there (nats).
         information: (K, K) on the kind's own parameters.
     """
 
@@ -58,8 +58,8 @@ class Subset:
         """Choose rays evenly.
 
         Args:
-            bundle: the rays.
-            about: about how many.
+            bundle: The rays.
+            about: About how many.
 
         Returns:
             The subset.
@@ -72,8 +72,8 @@ def starts(guess: Primitive, kind: Kind) -> list[FloatArray]:
     """Make starts of a kind's fit for what was taken for another: same centroid, same second moments of area.
 
     Args:
-        guess: what it was taken for.
-        kind: the kind to fit.
+        guess: What it was taken for.
+        kind: The kind to fit.
 
     Returns:
         Parameters (5,), one for each start angle.
@@ -100,8 +100,8 @@ def start_turns(kind: Kind, guessed: Kind) -> list[float]:
     turns else; and where the guess is of this kind already, the turns that almost regular shapes confuse.
 
     Args:
-        kind: the kind to fit.
-        guessed: the guess's kind.
+        kind: The kind to fit.
+        guessed: The guess's kind.
 
     Returns:
         Angles (rad).
@@ -130,11 +130,11 @@ def fit_all_kinds(
     best of each kind are fitted to more rays.
 
     Args:
-        guess: what the candidate is taken for.
-        earlier: earlier fits.
-        bundle: its rays.
-        sensor: the sensor.
-        options: the numbers.
+        guess: What the candidate is taken for.
+        earlier: Earlier fits.
+        bundle: Its rays.
+        sensor: The sensor.
+        options: The numbers.
 
     Returns:
         The best fit of each kind that is not out of the question.
@@ -173,10 +173,10 @@ def refit(
     """Fit kinds to all rays from earlier fits, beside their special cases and what they are special cases of.
 
     Args:
-        fits: the earlier fits.
-        bundle: all rays.
-        sensor: the sensor.
-        options: the numbers.
+        fits: The earlier fits.
+        bundle: All rays.
+        sensor: The sensor.
+        options: The numbers.
 
     Returns:
         The best fit of each kind.
@@ -191,10 +191,10 @@ def refit_same_kind(
     """Fit one kind, and no other, to all rays from an earlier fit.
 
     Args:
-        fit: the earlier fit.
-        bundle: all rays.
-        sensor: the sensor.
-        options: the numbers.
+        fit: The earlier fit.
+        bundle: All rays.
+        sensor: The sensor.
+        options: The numbers.
 
     Returns:
         The fit alone.
@@ -234,9 +234,9 @@ def beyond_special_case(kind: Kind, p: FloatArray, stretch: float = DEFAULTS.fit
     Where that has no angle, they are stretched along four directions, since there is none to turn to.
 
     Args:
-        kind: the kind.
+        kind: The kind.
         p: (5,) parameters of its special case.
-        stretch: by which factor.
+        stretch: By which factor.
 
     Returns:
         Parameters (5,) of the starts.
@@ -255,7 +255,7 @@ def other_apexes(p: FloatArray, equilateral: float = DEFAULTS.fit.equilateral) -
 
     Args:
         p: (5,) parameters of an isosceles triangle: x, y, theta, base, height.
-        equilateral: sides whose ratio is beyond this factor are not nearly the same.
+        equilateral: Sides whose ratio is beyond this factor are not nearly the same.
 
     Returns:
         Two sets of parameters (5,), or none.

@@ -66,7 +66,7 @@ def primitive_of(kind: Kind, p: FloatArray) -> Primitive:
     """Make a primitive of a kind from parameters.
 
     Args:
-        kind: the kind.
+        kind: The kind.
         p: (5,) x, y, theta, width, height; sizes beyond the kind's own are left out.
 
     Returns:
@@ -81,7 +81,7 @@ def shape_ranges(kind: Kind, p: FloatArray, rays: FloatArray) -> FloatArray:
     """Cast rays against a shape.
 
     Args:
-        kind: its kind.
+        kind: Its kind.
         p: (5,) its parameters.
         rays: (7, N) as detect.refinement.kernels has them.
 
@@ -97,7 +97,7 @@ def ranges_to(primitive: Primitive, rays: FloatArray) -> FloatArray:
     """Cast rays against a primitive.
 
     Args:
-        primitive: the primitive.
+        primitive: The primitive.
         rays: (7, N).
 
     Returns:
@@ -110,9 +110,9 @@ def passes_within(primitive: Primitive, rays: FloatArray, reach: float) -> NDArr
     """Tell which rays come near a primitive.
 
     Args:
-        primitive: the primitive.
+        primitive: The primitive.
         rays: (7, N).
-        reach: how near (m) to its silhouette; below 0, how far inside of it.
+        reach: How near (m) to its silhouette; below 0, how far inside of it.
 
     Returns:
         (N,) bool.

@@ -177,7 +177,7 @@ def likelihood_table(outlier: float) -> FloatArray:
     sensor's range_min. NO_RETURN: log(Phi(x) + outlier), z its range_max. Rows 3 to 5 are their derivatives by x.
 
     Args:
-        outlier: the density of outliers in units of the Gaussian's peak.
+        outlier: The density of outliers in units of the Gaussian's peak.
 
     Returns:
         (6, 2 * TABLE_REACH * TABLE_SPACING + 1).
@@ -339,9 +339,9 @@ def _intersection(support: Any, enter: Any, is_round: Any) -> Any:
     that misses by less has the range of the silhouette's point.
 
     Args:
-        support: the support point of the unit outline along a direction.
-        enter: where a line enters it.
-        is_round: whether its silhouette's point slides along it.
+        support: The support point of the unit outline along a direction.
+        enter: Where a line enters it.
+        is_round: Whether its silhouette's point slides along it.
 
     Returns:
         The compiled function.
@@ -414,8 +414,8 @@ def _intersect_form(form: int, p: Any, rays: Any, block: Any, met: Any) -> None:
         form: BOX, ROUND or TRIANGLE.
         p: (5,) parameters.
         rays: (7, N).
-        block: the first ray, and how many (at most BLOCK).
-        met: the :class:`Intersections`, of which ranges and clearances are set.
+        block: The first ray, and how many (at most BLOCK).
+        met: The :class:`Intersections`, of which ranges and clearances are set.
     """
     first, count = block
     ranges, clearances, _ = met
@@ -633,11 +633,11 @@ def append_passing(
         directions: (N, 2) unit vectors in the laser's frame.
         outcomes: (N,) MEASURED, TOO_NEAR, NO_RETURN or INVALID.
         z: (N,) ranges, or the limits that they are beyond (m).
-        pose: of the laser: x, y (m), theta (rad).
+        pose: Of the laser: x, y (m), theta (rad).
         circle: x, y, radius (m).
-        scan: the scan's largest range (m) and its number.
-        store: what they are appended to, with room for N more.
-        size: how many rays it holds.
+        scan: The scan's largest range (m) and its number.
+        store: What they are appended to, with room for N more.
+        size: How many rays it holds.
 
     Returns:
         How many rays it holds now.
@@ -663,10 +663,10 @@ def occlude(outlines: Any, k: int, p: Any, reach: float, rays: Any) -> None:
     """Lower the OCCLUSION of rays to where they meet a shape.
 
     Args:
-        outlines: the kinds' outlines.
-        k: the kind's number.
+        outlines: The kinds' outlines.
+        k: The kind's number.
         p: (5,) parameters.
-        reach: the shape's circumradius (m).
+        reach: The shape's circumradius (m).
         rays: (7, N), changed in place.
     """
     ranges, clearances, scratch = np.empty(BLOCK), np.empty(BLOCK), np.empty((SCRATCH_ROWS, BLOCK))
@@ -689,7 +689,7 @@ def apply_occlusion(data: Any, background: Any, blocked: Any) -> None:
     """Set the BACKGROUND log-likelihood of rays that another surface occludes before the background.
 
     Args:
-        data: the :class:`RayData`, changed in place.
+        data: The :class:`RayData`, changed in place.
         background: (N,) ranges (m) to the map's surface behind the shape.
         blocked: (N,) whether the map blocks a ray before it comes near; its OCCLUSION becomes 0.
     """
@@ -706,8 +706,8 @@ def silhouette_clearances(outlines: Any, k: int, p: Any, rays: Any, out: Any) ->
     """Compute the clearances of rays.
 
     Args:
-        outlines: the kinds' outlines.
-        k: the kind's number.
+        outlines: The kinds' outlines.
+        k: The kind's number.
         p: (5,) parameters.
         rays: (7, N).
         out: (N,) gets the clearances (m): below 0 for a miss, -FAR where the shape lies behind.
@@ -723,8 +723,8 @@ def cast_rays(outlines: Any, k: int, p: Any, rays: Any, out: Any) -> None:
     """Compute the ranges of rays to a shape.
 
     Args:
-        outlines: the kinds' outlines.
-        k: the kind's number.
+        outlines: The kinds' outlines.
+        k: The kind's number.
         p: (5,) parameters.
         rays: (7, N).
         out: (N,) gets the ranges (m): FAR for a miss, 0 from inside.
@@ -742,12 +742,12 @@ def standardized_clearances(outlines: Any, k: int, p: Any, covariance: Any, rays
     """Compute the clearances of rays in standard deviations, for a shape whose parameters are uncertain.
 
     Args:
-        outlines: the kinds' outlines.
-        k: the kind's number.
+        outlines: The kinds' outlines.
+        k: The kind's number.
         p: (5,) parameters.
         covariance: (5, 5) of the parameters.
         rays: (7, N).
-        blur: half-width of the footprint (m).
+        blur: Half-width of the footprint (m).
         out: (N,) gets the clearances: below 0 for a miss, 0 where the footprint meets an edge, -FAR where a ray is
             occluded before it comes to the shape.
     """
@@ -800,10 +800,10 @@ def negative_log_likelihoods(outlines: Any, numbers: Any, samples: Any, data: An
     """Compute the negative log-likelihood of all rays for each of many shapes.
 
     Args:
-        outlines: the kinds' outlines.
+        outlines: The kinds' outlines.
         numbers: (M,) the kinds' numbers.
         samples: (M, 5) parameters.
-        data: the :class:`RayData`.
+        data: The :class:`RayData`.
         blur: (m).
         out: (M,) gets the costs (nats).
     """
@@ -838,10 +838,10 @@ def _gradient(  # noqa: C901 - one pass over the rays
     The information is Gauss and Newton's for rays that hit, and the squared score for rays at silhouettes.
 
     Args:
-        outlines: the kinds' outlines.
-        k: the kind's number.
+        outlines: The kinds' outlines.
+        k: The kind's number.
         p: (5,) parameters.
-        data: the :class:`RayData`.
+        data: The :class:`RayData`.
         blur: (m).
         gradient: (5,) gets the gradient by p.
         information: (5, 5) gets the information on p.
@@ -991,10 +991,10 @@ def descend(outlines: Any, starts: Any, data: Any, schedule: Any, cost: Any, inf
     """Minimise the negative log-likelihood from each of some shapes by Levenberg and Marquardt's method.
 
     Args:
-        outlines: the kinds' outlines.
-        starts: the :class:`Starts`; their shapes are changed in place.
-        data: the :class:`RayData`.
-        schedule: the :class:`Schedule`.
+        outlines: The kinds' outlines.
+        starts: The :class:`Starts`; their shapes are changed in place.
+        data: The :class:`RayData`.
+        schedule: The :class:`Schedule`.
         cost: (M,) gets the costs (nats) at the last blur.
         information: (M, 5, 5) gets the information on own parameters.
     """

@@ -28,11 +28,11 @@ def find_lines(
 
     Args:
         points: (N, 2) centres (m).
-        resolution: the cells' side (m).
-        min_length: a line has cells for this length (m) at least.
-        max_lines: how many to find at most.
-        width: cells lie within this distance (cells) of a line.
-        options: the numbers.
+        resolution: The cells' side (m).
+        min_length: A line has cells for this length (m) at least.
+        max_lines: How many to find at most.
+        width: Cells lie within this distance (cells) of a line.
+        options: The numbers.
 
     Returns:
         The lines.
@@ -58,8 +58,8 @@ def trimmed_line(points: FloatArray, resolution: float, options: LineOptions = D
 
     Args:
         points: (N, 2) in metres.
-        resolution: points within this distance (m) always count.
-        options: the numbers.
+        resolution: Points within this distance (m) always count.
+        options: The numbers.
 
     Returns:
         The line.
@@ -76,7 +76,7 @@ def distance_to_line(points: FloatArray, line: Line) -> FloatArray:
 
     Args:
         points: (N, 2).
-        line: the line.
+        line: The line.
 
     Returns:
         (N,) 0 or more.
@@ -109,8 +109,8 @@ def best_pair(points: Any, pairs: Any, within: float, baseline: float) -> int:
     Args:
         points: (2, N).
         pairs: (T, 2) indices.
-        within: distance (m) from the line.
-        baseline: pairs that are nearer to each other (m) have no line.
+        within: Distance (m) from the line.
+        baseline: Pairs that are nearer to each other (m) have no line.
 
     Returns:
         The index of the pair: the first of equals.

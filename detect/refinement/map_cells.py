@@ -26,10 +26,10 @@ class OneSidedWall:
     """A wall with free space on one side only.
 
     Attributes:
-        line: its line; the normal points to the free side.
-        first: where it begins along the line (m).
-        last: where it ends.
-        depth: how far (m) it reaches to the other side.
+        line: Its line; the normal points to the free side.
+        first: Where it begins along the line (m).
+        last: Where it ends.
+        depth: How far (m) it reaches to the other side.
     """
 
     line: Line
@@ -42,8 +42,8 @@ class OneSidedWall:
 
         Args:
             points: (N, 2) in metres, map frame.
-            penetration: how far (m) behind its line they must lie.
-            extension: how far (m) it would go on beyond its ends.
+            penetration: How far (m) behind its line they must lie.
+            extension: How far (m) it would go on beyond its ends.
 
         Returns:
             Whether any does.
@@ -59,13 +59,13 @@ class MapCells:
     """A map's cells, all (rows, cols).
 
     Attributes:
-        frame: where they lie.
-        occupied: occupied cells.
-        free: free cells.
-        labels: the occupied cells' connected components, from 1 on; 0 elsewhere.
-        large: occupied cells of walls and of components larger than any primitive.
-        walls: the walls with free space on one side only.
-        options: the numbers.
+        frame: Where they lie.
+        occupied: Occupied cells.
+        free: Free cells.
+        labels: The occupied cells' connected components, from 1 on; 0 elsewhere.
+        large: Occupied cells of walls and of components larger than any primitive.
+        walls: The walls with free space on one side only.
+        options: The numbers.
     """
 
     frame: GridFrame
@@ -84,8 +84,8 @@ class MapCells:
         close to it.
 
         Args:
-            grid: the map.
-            options: the numbers.
+            grid: The map.
+            options: The numbers.
 
         Returns:
             The cells.
@@ -103,8 +103,8 @@ class MapCells:
         """Find large things' cells in a primitive or near it.
 
         Args:
-            primitive: the primitive.
-            margin: how near (m).
+            primitive: The primitive.
+            margin: How near (m).
 
         Returns:
             Their rows and columns.
@@ -132,8 +132,8 @@ class MapCells:
         """Return the occupied cells (rows, cols) but for those of primitives.
 
         Args:
-            primitives: the primitives.
-            margin: cells this near (m) are a primitive's; of walls' cells, those that all but touch it.
+            primitives: The primitives.
+            margin: Cells this near (m) are a primitive's; of walls' cells, those that all but touch it.
 
         Returns:
             (rows, cols) bool.
@@ -229,9 +229,9 @@ def is_within(primitive: Primitive, points: NDArray[np.floating], margin: float)
     """Tell which points lie in a primitive or near it.
 
     Args:
-        primitive: the primitive.
+        primitive: The primitive.
         points: (..., 2) in metres, map frame.
-        margin: how far outside (m); edges are moved outwards, so that corners reach further.
+        margin: How far outside (m); edges are moved outwards, so that corners reach further.
 
     Returns:
         (...) bool.

@@ -28,10 +28,10 @@ def propose(
     """Propose rectangles around the largest components that are in no known primitive.
 
     Args:
-        cells: the map.
-        known: the primitives that are candidates already.
-        max_proposals: how many at most; None: ``options.max_proposals``.
-        options: the numbers.
+        cells: The map.
+        known: The primitives that are candidates already.
+        max_proposals: How many at most; None: ``options.max_proposals``.
+        options: The numbers.
 
     Returns:
         Rectangles, those of most cells first.
@@ -57,8 +57,8 @@ def components(cells: MapCells, options: ProposalOptions = DEFAULTS.proposals) -
     """Yield connected components of occupied cells that are not large and stand in free space.
 
     Args:
-        cells: the map.
-        options: the numbers.
+        cells: The map.
+        options: The numbers.
 
     Yields:
         The centres (N, 2) in metres of each component's cells.
@@ -94,8 +94,8 @@ def bounding_rectangle(
 
     Args:
         points: (N, 2) cells' centres (m).
-        resolution: the cells' side (m).
-        options: the numbers.
+        resolution: The cells' side (m).
+        options: The numbers.
 
     Returns:
         The rectangle; None where it is smaller or larger than primitives are.

@@ -55,8 +55,8 @@ class RayBundle:
         """Tell which rays come near a primitive.
 
         Args:
-            primitive: the primitive.
-            reach: how near (m).
+            primitive: The primitive.
+            reach: How near (m).
 
         Returns:
             (N,) bool.
@@ -67,8 +67,8 @@ class RayBundle:
         """Tell whether nearly all of the same rays have nearly the same background and occlusion.
 
         Args:
-            other: the same rays, with another background.
-            options: the thresholds (``options.rays``).
+            other: The same rays, with another background.
+            options: The thresholds (``options.rays``).
 
         Returns:
             Whether a fit to one holds for the other.
@@ -142,7 +142,7 @@ class RayCollector:
         Args:
             centres: (M, 2) in metres, map frame.
             reach: (M,) radii (m).
-            options: how many rays at most (``options.rays``), and from how many scans the noise is bounded.
+            options: How many rays at most (``options.rays``), and from how many scans the noise is bounded.
         """
         self._centres, self._reach, self._options = centres, reach, options
         self._buffers = [RayBuffer(options.rays.max_rays) for _ in reach]
@@ -154,8 +154,8 @@ class RayCollector:
         """Add a scan, or the next part of one.
 
         Args:
-            scan: the scan.
-            pose: of the laser, in the map frame.
+            scan: The scan.
+            pose: Of the laser, in the map frame.
         """
         self._scans += scan.first_beam == 0
         if len(self._ranges) < self._options.sensor.noise_scans:
@@ -215,10 +215,10 @@ def collect_rays(
     """Collect the rays that come near each primitive.
 
     Args:
-        scans: scans and the poses of their laser, in the map frame.
-        primitives: the primitives.
-        reach: how near (m) to their circumscribed circles.
-        options: the limits.
+        scans: Scans and the poses of their laser, in the map frame.
+        primitives: The primitives.
+        reach: How near (m) to their circumscribed circles.
+        options: The limits.
 
     Returns:
         A bundle for each primitive, the largest span of ranges (m), and an upper bound of the noise (m).

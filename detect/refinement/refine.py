@@ -45,14 +45,14 @@ class RefinedPrimitive:
     """A primitive that was fitted to rays.
 
     Attributes:
-        primitive: the likeliest kind at its posterior mean.
-        std: standard deviations (m, rad) by name: x, y, theta and the sizes.
+        primitive: The likeliest kind at its posterior mean.
+        std: Standard deviations (m, rad) by name: x, y, theta and the sizes.
         covariance: (K, K) in the same order.
-        chances: posterior probabilities of the kinds.
-        gain: log-likelihood gain of the rays over an empty place (nats).
-        misfit: by how much the map alone explains the rays that meet it better (nats a ray).
-        rays: how many rays meet it.
-        seen: share of the directions around it in which they do.
+        chances: Posterior probabilities of the kinds.
+        gain: Log-likelihood gain of the rays over an empty place (nats).
+        misfit: By how much the map alone explains the rays that meet it better (nats a ray).
+        rays: How many rays meet it.
+        seen: Share of the directions around it in which they do.
     """
 
     primitive: Primitive
@@ -83,10 +83,10 @@ class Effort:
     """How thoroughly detections are refined.
 
     Attributes:
-        warm_start: an earlier pass. What was sure of its kind then is fitted on from there, which takes a fraction of
+        warm_start: An earlier pass. What was sure of its kind then is fitted on from there, which takes a fraction of
             the time, and the map is not searched for what the networks missed.
-        max_proposals: components of the map that are proposed; None: as in the options.
-        rounds: joint fits once duplicates are gone; None: as in the options.
+        max_proposals: Components of the map that are proposed; None: as in the options.
+        rounds: Joint fits once duplicates are gone; None: as in the options.
     """
 
     warm_start: WarmStart | None = None
@@ -109,13 +109,13 @@ def refine_detections(
     """Refine a map's detections, and find what the networks missed.
 
     Args:
-        detections: of the networks.
-        scans: the scans that the map was made of, with the poses of their laser.
-        grid: the map.
-        noise_std: range noise (m) where it is known.
-        threads: how many are used; results do not depend on it.
-        effort: how thoroughly.
-        options: the numbers.
+        detections: Of the networks.
+        scans: The scans that the map was made of, with the poses of their laser.
+        grid: The map.
+        noise_std: Range noise (m) where it is known.
+        threads: How many are used; results do not depend on it.
+        effort: How thoroughly.
+        options: The numbers.
 
     Returns:
         What the rays support, likeliest kinds first, and what they do not, with the reasons; and the noise (m), None
@@ -201,8 +201,8 @@ def rejection_reason(result: RefinedPrimitive | None, limits: AcceptanceOptions 
     """Say why the rays contradict a primitive.
 
     Args:
-        result: what refinement made of it.
-        limits: the thresholds.
+        result: What refinement made of it.
+        limits: The thresholds.
 
     Returns:
         The reason; empty where they do not.
@@ -229,10 +229,10 @@ def proposal_rejection_reason(
     """Say why something that the networks did not find, or were not sure of, is no detection.
 
     Args:
-        result: what refinement made of it.
-        guess: what it was proposed as.
-        cells: the map.
-        limits: the thresholds.
+        result: What refinement made of it.
+        guess: What it was proposed as.
+        cells: The map.
+        limits: The thresholds.
 
     Returns:
         The reason; empty where it is one.
@@ -268,12 +268,12 @@ class Refinement:
     """Fits primitives to the rays of the scans that a map was made of.
 
     Attributes:
-        cells: the map.
-        noise_std: the range noise (m): known, or estimated by :meth:`run`.
-        threads: how many are used.
-        guessed_noise: a first guess (m) of the noise, where there is one.
-        rounds: joint fits once duplicates are gone; None: as in the options.
-        options: the numbers.
+        cells: The map.
+        noise_std: The range noise (m): known, or estimated by :meth:`run`.
+        threads: How many are used.
+        guessed_noise: A first guess (m) of the noise, where there is one.
+        rounds: Joint fits once duplicates are gone; None: as in the options.
+        options: The numbers.
     """
 
     cells: MapCells
@@ -293,10 +293,10 @@ class Refinement:
         """Refine primitives beside each other.
 
         Args:
-            primitives: the guesses.
-            scans: the scans and the poses of their laser, in the map frame.
-            known: by index, detections whose kind is not asked again.
-            preferred: of duplicates the first so many win against others that explain the rays little better.
+            primitives: The guesses.
+            scans: The scans and the poses of their laser, in the map frame.
+            known: By index, detections whose kind is not asked again.
+            preferred: Of duplicates the first so many win against others that explain the rays little better.
 
         Returns:
             Each refined, in the order given; None for one that no ray passes, that is the duplicate of another, or
@@ -364,9 +364,9 @@ def without_duplicates(
     """Remove candidates that stand where one with a larger gain does.
 
     Args:
-        candidates: the fitted candidates.
-        preferred: those that win against others whose gain is little larger.
-        sensor: the sensor.
+        candidates: The fitted candidates.
+        preferred: Those that win against others whose gain is little larger.
+        sensor: The sensor.
 
     Returns:
         The rest, largest gain first.
@@ -387,9 +387,9 @@ def gain_of(candidate: Candidate, others: Sequence[Candidate], sensor: BeamModel
     """Compute the log-likelihood gain of the rays over nothing in a candidate's place.
 
     Args:
-        candidate: the candidate.
-        others: the candidates that may occlude it.
-        sensor: the sensor.
+        candidate: The candidate.
+        others: The candidates that may occlude it.
+        sensor: The sensor.
 
     Returns:
         Nats.
@@ -402,9 +402,9 @@ def finish(candidate: Candidate, map_alone: Background, sensor: BeamModel) -> Re
     """Compare a candidate's kinds and hold the likeliest one against the map alone.
 
     Args:
-        candidate: the fitted candidate.
-        map_alone: what its rays meet in the map with the candidate's own cells.
-        sensor: the sensor.
+        candidate: The fitted candidate.
+        map_alone: What its rays meet in the map with the candidate's own cells.
+        sensor: The sensor.
 
     Returns:
         The result; None where no kind is possible there.

@@ -27,8 +27,8 @@ def initial_noise(candidates: Sequence[Candidate], options: SensorOptions = DEFA
     """Estimate the noise before any fit, robustly: the median absolute residual from the guesses' surfaces.
 
     Args:
-        candidates: the candidates.
-        options: the bounds.
+        candidates: The candidates.
+        options: The bounds.
 
     Returns:
         Metres.
@@ -50,9 +50,9 @@ def estimate_sensor(candidates: Sequence[Candidate], sensor: BeamModel, noise_st
     """Estimate noise, footprint and dispersion from all candidates together.
 
     Args:
-        candidates: the fitted candidates.
-        sensor: the sensor so far.
-        noise_std: the range noise (m) where it is known.
+        candidates: The fitted candidates.
+        sensor: The sensor so far.
+        noise_std: The range noise (m) where it is known.
 
     Returns:
         The sensor.
@@ -71,8 +71,8 @@ def estimate_footprint(candidates: Sequence[Candidate], sensor: BeamModel) -> fl
     """Find the footprint that makes the rays near candidates' silhouettes most likely.
 
     Args:
-        candidates: the fitted candidates.
-        sensor: the sensor.
+        candidates: The fitted candidates.
+        sensor: The sensor.
 
     Returns:
         Metres; 0 where the best one is not clearly above it.
@@ -94,8 +94,8 @@ def scan_dispersion(candidates: Sequence[Candidate], sensor: BeamModel) -> float
     """Estimate the dispersion of scans: the factor by which mean residuals of scans scatter beyond independent rays.
 
     Args:
-        candidates: the fitted candidates.
-        sensor: the sensor.
+        candidates: The fitted candidates.
+        sensor: The sensor.
 
     Returns:
         1 or more.
@@ -126,8 +126,8 @@ def clustered_dispersion(candidates: Sequence[Candidate], sensor: BeamModel) -> 
     of which the largest significant one counts.
 
     Args:
-        candidates: the fitted candidates.
-        sensor: the sensor.
+        candidates: The fitted candidates.
+        sensor: The sensor.
 
     Returns:
         1 or more.
@@ -185,8 +185,8 @@ def estimate_noise(candidates: Sequence[Candidate], sensor: BeamModel) -> float:
     """Find the noise that makes the rays which meet candidates most likely, censored measurements among them.
 
     Args:
-        candidates: the fitted candidates.
-        sensor: the sensor so far.
+        candidates: The fitted candidates.
+        sensor: The sensor so far.
 
     Returns:
         Metres.
@@ -201,8 +201,8 @@ def maximum_likelihood_noise(
     """Find the noise that makes measurements of known surfaces most likely.
 
     Args:
-        met: ranges to the surfaces (m), outcomes, and measured ranges or their limits (m), each (N,).
-        sensor: the sensor so far; its noise stays where too few ranges were measured.
+        met: Ranges to the surfaces (m), outcomes, and measured ranges or their limits (m), each (N,).
+        sensor: The sensor so far; its noise stays where too few ranges were measured.
 
     Returns:
         Metres.

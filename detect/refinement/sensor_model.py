@@ -41,15 +41,15 @@ class BeamModel:
     """What is known of the sensor.
 
     Attributes:
-        std: range noise (m).
+        std: Range noise (m).
         span: range_max - range_min (m).
-        table: log-likelihoods (6, T) of :func:`detect.refinement.kernels.likelihood_table`.
-        footprint: half the width (m) over which a beam that passes an edge may meet it or not: the beam's own width
+        table: Log-likelihoods (6, T) of :func:`detect.refinement.kernels.likelihood_table`.
+        footprint: Half the width (m) over which a beam that passes an edge may meet it or not: the beam's own width
             and the errors of poses and bearings.
-        dispersion: the factor by which squared errors of whole scans exceed those of independent rays; 1 where poses
+        dispersion: The factor by which squared errors of whole scans exceed those of independent rays; 1 where poses
             are exact.
-        max_std: upper bound of the noise (m).
-        options: the model's numbers.
+        max_std: Upper bound of the noise (m).
+        options: The model's numbers.
     """
 
     std: float
@@ -73,12 +73,12 @@ class BeamModel:
         """Make a model with the table that follows from noise and span.
 
         Args:
-            std: range noise (m).
+            std: Range noise (m).
             span: range_max - range_min (m).
-            footprint: half-width (m).
+            footprint: Half-width (m).
             dispersion: 1 or more.
-            max_std: upper bound of the noise (m).
-            options: the model's numbers.
+            max_std: Upper bound of the noise (m).
+            options: The model's numbers.
 
         Returns:
             The model.
@@ -104,7 +104,7 @@ class Background:
         ranges: (N,) where they end (m).
         ends: (N,) whether that is an occupied cell; the others leave the map there.
         blocked: (N,) whether they end before they come near the primitive.
-        uncertainty: standard deviation of the ranges (m).
+        uncertainty: Standard deviation of the ranges (m).
     """
 
     ranges: FloatArray
@@ -130,7 +130,7 @@ class ClearanceMap:
 
         Args:
             occupied: (rows, cols) the map's occupied cells.
-            frame: where they lie.
+            frame: Where they lie.
 
         Returns:
             The map of distances.
@@ -153,8 +153,8 @@ def background_log_likelihood(bundle: RayBundle, background: Background, sensor:
 
     Args:
         bundle: N rays.
-        background: what they meet.
-        sensor: the sensor.
+        background: What they meet.
+        sensor: The sensor.
 
     Returns:
         (N,) in nats.
@@ -174,10 +174,10 @@ def with_background(
 
     Args:
         bundle: N rays.
-        background: what they meet in the map.
+        background: What they meet in the map.
         log_likelihood: (N,) of :func:`background_log_likelihood`.
-        occluders: other primitives and walls, which may stand before the primitive or the background.
-        sensor: the sensor.
+        occluders: Other primitives and walls, which may stand before the primitive or the background.
+        sensor: The sensor.
 
     Returns:
         The rays with both rows set.
@@ -195,7 +195,7 @@ def table_nearest(table: FloatArray, outcomes: NDArray[np.int8], x: FloatArray) 
     """Look up log-likelihoods without interpolation.
 
     Args:
-        table: of :func:`detect.refinement.kernels.likelihood_table`.
+        table: Of :func:`detect.refinement.kernels.likelihood_table`.
         outcomes: (N,) rows.
         x: (N,) residuals in standard deviations.
 
@@ -218,8 +218,8 @@ def surface_likelihood(
         bundle: N rays.
         ranges: (N,) where they end or leave (m).
         ends: (N,) whether they end.
-        uncertainty: standard deviation of these ranges (m).
-        sensor: the sensor.
+        uncertainty: Standard deviation of these ranges (m).
+        sensor: The sensor.
 
     Returns:
         (N,) in units of the Gaussian's peak for measured ranges.

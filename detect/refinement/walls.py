@@ -25,10 +25,10 @@ class Wall:
     """A stretch of a wall behind a candidate.
 
     Attributes:
-        behind: the candidate's guess.
-        stretch: a thin rectangle that stands for the wall there.
-        line: its line; the normal points to the candidate's side.
-        cells: rows and columns of the map's cells that belong to it.
+        behind: The candidate's guess.
+        stretch: A thin rectangle that stands for the wall there.
+        line: Its line; the normal points to the candidate's side.
+        cells: Rows and columns of the map's cells that belong to it.
     """
 
     behind: Primitive
@@ -40,8 +40,8 @@ class Wall:
         """Tell whether a primitive reaches behind the stretch.
 
         Args:
-            primitive: the primitive.
-            depth: by how much (m) more than the line is uncertain.
+            primitive: The primitive.
+            depth: By how much (m) more than the line is uncertain.
 
         Returns:
             Whether it does.
@@ -62,10 +62,10 @@ def walls_behind(
     """Find the walls that candidates stand close to, and that show straight on both sides of them.
 
     Args:
-        cells: the map.
-        candidates: the candidates as they are known now.
-        guesses: what they were taken for first: a wall is seen from the side on which that stands.
-        options: the numbers.
+        cells: The map.
+        candidates: The candidates as they are known now.
+        guesses: What they were taken for first: a wall is seen from the side on which that stands.
+        options: The numbers.
 
     Returns:
         The walls.

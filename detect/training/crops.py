@@ -25,7 +25,6 @@ class CropSamples:
     Attributes:
         images: Grey images (TILE_SIZE, TILE_SIZE) of the tiles.
         items: For each primitive the index of its image, the tile's frame, and the primitive in the map frame.
-
     """
 
     images: tuple[NDArray[np.uint8], ...]
@@ -43,7 +42,6 @@ class CropSamples:
 
         Returns:
             The crop (pixels, pixels) at the true box, and the primitive relative to the centre of its window (m).
-
         """
         image, tile, primitive = self.items[index]
         return self._cropped(image, tile, primitive, bounding_box(primitive, tile), preset)
@@ -58,7 +56,6 @@ class CropSamples:
 
         Returns:
             As :meth:`plain`.
-
         """
         image, tile, primitive = self.items[index]
         box = jitter_box(bounding_box(primitive, tile), rng)
@@ -84,7 +81,6 @@ def collect_crops(samples: Sequence[Sample], kinds: Sequence[Kind]) -> CropSampl
 
     Returns:
         Their crops, in the order of the tiles.
-
     """
     from PIL import Image
 
@@ -107,7 +103,6 @@ def jitter_box(box: Box, rng: np.random.Generator) -> Box:
 
     Returns:
         The jittered box.
-
     """
     left, top, right, bottom = box
     dx, dy = JITTER * (right - left), JITTER * (bottom - top)
@@ -132,7 +127,6 @@ def rotate_by_quarters(primitive: Primitive, quarters: int) -> Primitive:
 
     Returns:
         The rotated primitive.
-
     """
     cos, sin = ((1, 0), (0, 1), (-1, 0), (0, -1))[quarters % 4]
     x, y = cos * primitive.x - sin * primitive.y, sin * primitive.x + cos * primitive.y

@@ -76,7 +76,6 @@ class DatasetOptions:
 
     Raises:
         UsageError: The options are impossible.
-
     """
 
     sizes: tuple[int, int] = (500, 125)
@@ -140,7 +139,6 @@ def session_options(options: DatasetOptions, seed: int) -> SessionOptions:
 
     Returns:
         The session's options.
-
     """
     rng = np.random.default_rng((seed, 1))
     floor = float(rng.choice(options.floors))
@@ -176,7 +174,6 @@ def make_dataset(
     Raises:
         UsageError: The folder holds a data set with other options.
         OutputError: The folder cannot be written.
-
     """
     _prepare_folder(folder, options)
     missing = [job for job in session_seeds(options) if not _done(folder, *job).exists()]
@@ -249,7 +246,6 @@ def map_frame(world: World, resolution: float) -> GridFrame:
 
     Returns:
         A frame that covers the floor and MAP_MARGIN around it.
-
     """
     x0, y0, x1, y1 = world.bounds
     bounds = (x0 - MAP_MARGIN, y0 - MAP_MARGIN, x1 + MAP_MARGIN, y1 + MAP_MARGIN)
@@ -292,7 +288,6 @@ def map_scans(mapper: str, scans: Sequence[tuple[Scan, Pose2D]], resolution: flo
 
     Returns:
         The finished map.
-
     """
     made = make_mapper(mapper, resolution, bounds)
     for scan, pose in scans:
@@ -309,7 +304,6 @@ def primitives_in_tile(primitives: Sequence[Primitive], tile: GridFrame) -> tupl
 
     Returns:
         Those with at least MIN_INSIDE_SHARE of their outlines within it.
-
     """
     return tuple(primitive for primitive in primitives if share_inside(primitive, tile) >= MIN_INSIDE_SHARE)
 
@@ -323,7 +317,6 @@ def share_inside(primitive: Primitive, tile: GridFrame) -> float:
 
     Returns:
         The share of the outline's length, 0 to 1.
-
     """
     import shapely
 
@@ -342,7 +335,6 @@ def yolo_label(primitive: Primitive, tile: GridFrame) -> str:
 
     Returns:
         A line: class index, then x and y of each vertex as shares of the image, clipped to the tile.
-
     """
     points = np.clip(primitive.outline() / tile.resolution - (tile.col, tile.row), 0, TILE_SIZE) / TILE_SIZE
     return " ".join([str(KINDS.index(primitive.kind)), *(f"{value:.6f}" for value in points.ravel())]) + "\n"
@@ -357,7 +349,6 @@ def bounding_box(primitive: Primitive, tile: GridFrame) -> Box:
 
     Returns:
         Left, top, right, bottom in cells of the tile; row 0 at the top.
-
     """
     cells = primitive.outline() / tile.resolution - (tile.col, tile.row)
     (left, top), (right, bottom) = np.clip(cells.min(axis=0), 0, TILE_SIZE), np.clip(cells.max(axis=0), 0, TILE_SIZE)
@@ -370,7 +361,6 @@ def write_image(path: Path, image: NDArray[np.uint8]) -> None:
     Args:
         path: Its file.
         image: (rows, cols, 3).
-
     """
     from PIL import Image
 
@@ -385,7 +375,6 @@ def write_data_yaml(folder: Path, mapper: str) -> None:
     Args:
         folder: Folder of the data set.
         mapper: Name of the mapper, or of what made the images.
-
     """
     names = "".join(f"  {k}: {kind.value}\n" for k, kind in enumerate(KINDS))
     text = f"path: {folder.resolve()}\ntrain: images/{mapper}/train\nval: images/{mapper}/val\nnames:\n{names}"
@@ -401,7 +390,6 @@ class Sample:
         frame: Its frame.
         primitives: The primitives that belong to it, map frame.
         noise_std: Standard deviation of the range noise (m) that it was recorded with.
-
     """
 
     image: Path
@@ -423,7 +411,6 @@ def load_samples(folder: Path, mapper: str, split: str) -> list[Sample]:
 
     Raises:
         UsageError: The folder holds no such data set.
-
     """
     paths = sorted((folder / "truth" / split).glob("*.json"))
     if not paths or not (folder / f"{mapper}.yaml").exists():
@@ -443,7 +430,6 @@ def image_style(folder: Path, mapper: str) -> str:
 
     Raises:
         UsageError: The folder holds no data set.
-
     """
     try:
         manifest = json.loads((folder / "manifest.json").read_text(encoding="utf-8"))

@@ -64,7 +64,6 @@ class DrawingOptions:
 
     Raises:
         UsageError: There are no drawings.
-
     """
 
     sizes: tuple[int, int] = (6000, 100)
@@ -88,7 +87,6 @@ def make_drawings(folder: Path, options: DrawingOptions, progress: Progress | No
 
     Raises:
         UsageError: The folder holds a data set with other options.
-
     """
     manifest = json.dumps({"version": 1, "tile": TILE_SIZE} | vars(options)) + "\n"
     path = folder / "manifest.json"

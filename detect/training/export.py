@@ -48,7 +48,6 @@ def export_cnn(checkpoint: Path, mapper: str, output: Path, about: Mapping[str, 
 
     Raises:
         UsageError: The file is no such checkpoint, or is for another mapper's maps.
-
     """
     network, state = _read_checkpoint(checkpoint)
     if state["mapper"] != mapper:
@@ -109,7 +108,6 @@ def export_yolo(
 
     Raises:
         UsageError: The file is not trusted, or not there.
-
     """
     if not trust:
         raise UsageError(f"{weights} is a pickle, which can run code: add --trust if you know where it is from")
@@ -142,7 +140,6 @@ def import_yolo(path: Path, images: torch.Tensor, output: Path) -> Path:
 
     Raises:
         UsageError: The file is no such network.
-
     """
     from ultralytics.nn.tasks import DetectionModel
 
@@ -169,7 +166,6 @@ def import_cnn(path: Path, network: ParameterNetwork, crops: torch.Tensor) -> No
 
     Raises:
         UsageError: The file is no such network.
-
     """
     folded = _read_arrays(path)
     unnamed = [name for name in folded if name.startswith("onnx::Conv")]
@@ -278,7 +274,6 @@ def write_card(path: Path, card: ModelCard) -> None:
     Args:
         path: The file.
         card: The model card.
-
     """
     import onnx
 

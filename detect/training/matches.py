@@ -28,7 +28,6 @@ class ScoredBoxes:
         boxes: The candidates.
         true_box: (N, 4) true boxes, in the unit of the candidates'.
         true_kind: (N,) their class indices (of KINDS).
-
     """
 
     boxes: Boxes
@@ -43,7 +42,6 @@ class LabelledImage:
     Attributes:
         sample: The tile and its primitives.
         image: (TILE_SIZE, TILE_SIZE, 3).
-
     """
 
     sample: Sample
@@ -74,7 +72,6 @@ class KindMatches:
         score: (N,) their scores.
         hit: (N, len(MATCH_IOUS)) whether they are true positives.
         truths: Number of true boxes of the kind.
-
     """
 
     score: NDArray[np.float32]
@@ -105,7 +102,6 @@ def match_kind(images: Sequence[ScoredBoxes], index: int) -> KindMatches:
 
     Returns:
         The candidates of all images with their matches.
-
     """
     score, hit = [np.empty(0, np.float32)], [np.empty((0, len(MATCH_IOUS)), bool)]
     truths = 0

@@ -30,7 +30,6 @@ class LayerWidths:
     Attributes:
         filters: Filters of each convolution.
         neurons: Neurons of each fully connected layer but the last.
-
     """
 
     filters: tuple[int, ...]
@@ -51,7 +50,6 @@ class ParameterNetwork(nn.Module):
         kinds: The kinds, in the order of the outputs.
         preset: The encoding.
         channels: Channels of the crops.
-
     """
 
     def __init__(self, kinds: Sequence[Kind], preset: Preset, channels: int = 1) -> None:

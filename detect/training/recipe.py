@@ -44,7 +44,6 @@ def announce_duration(step: str, announce: Announce) -> Iterator[None]:
 
     Yields:
         Once, for the step to run.
-
     """
     began = time.monotonic()
     yield
@@ -62,7 +61,6 @@ def pretrain_yolo(work: Path, announce: Announce) -> Path:
 
     Returns:
         The weights.
-
     """
     from detect.training.train import YOLO_PRESETS, train_yolo
 
@@ -82,7 +80,6 @@ def ensure_dataset(folder: Path, options: DatasetOptions, announce: Announce) ->
 
     Returns:
         ``folder``.
-
     """
     with announce_duration(f"{folder.name}: {sum(options.sizes)} sessions", announce):
         make_dataset(folder, options)
@@ -113,7 +110,6 @@ def train_weights(
 
     Returns:
         ``folder``.
-
     """
     if (folder / DETECTOR_FILE).exists():
         return folder
@@ -144,7 +140,6 @@ def store_thresholds(yolo: Path, data: Path) -> None:
     Args:
         yolo: The network's ONNX file.
         data: Folder of a data set; its validation split is used.
-
     """
     from detect.training.export import write_card
 
@@ -166,7 +161,6 @@ def train_all(work: Path, mappers: Sequence[str], announce: Announce) -> Iterato
 
     Yields:
         The folder of each mapper's weights.
-
     """
     start, mixed = pretrain_yolo(work, announce), ensure_dataset(work / "mixed", MIXED, announce)
     first = train_weights(mixed, FIRST_MAPPER, work / "first", "prim", start, announce, provenance(MIXED))

@@ -24,7 +24,6 @@ def choose_thresholds(yolo: Yolo, samples: Sequence[Sample], options: DetectorOp
 
     Returns:
         Thresholds by the names of the kinds that occur.
-
     """
     images: list[ScoredBoxes] = []
     for begin in range(0, len(samples), options.batch_size):

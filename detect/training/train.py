@@ -54,7 +54,6 @@ class CnnOptions:
 
     Raises:
         UsageError: The options are impossible.
-
     """
 
     preset: str = PRIM.name
@@ -93,7 +92,6 @@ def network_kinds(preset: str, kinds: Sequence[Kind]) -> list[tuple[Kind, ...]]:
 
     Returns:
         The kinds of each network.
-
     """
     return [(kind,) for kind in kinds] if preset == PAPER.name else [tuple(kinds)]
 
@@ -107,7 +105,6 @@ def checkpoint_name(mapper: str, kinds: Sequence[Kind]) -> str:
 
     Returns:
         The file name.
-
     """
     return ".".join(["cnn", mapper, *([] if len(kinds) == len(Kind) else ["-".join(kinds)]), "pt"])
 
@@ -135,7 +132,6 @@ def train_cnn(
 
     Raises:
         UsageError: The data set holds no primitive of these kinds, or the checkpoint has other options.
-
     """
     torch.manual_seed(options.seed)
     training, validation = (collect_crops(load_samples(data, mapper, split), kinds) for split in ("train", "val"))
@@ -220,7 +216,6 @@ def validation_loss(network: ParameterNetwork, crops: CropSamples, batch: int = 
 
     Returns:
         The mean loss; 0 where there are no crops.
-
     """
     network.eval()
     total = 0.0
@@ -263,7 +258,6 @@ def stack_crops(samples: Sequence[tuple[Any, Any]], channels: int) -> torch.Tens
 
     Returns:
         (N, channels, pixels, pixels) in 0 to 1.
-
     """
     grey = torch.from_numpy(np.stack([crop for crop, _ in samples])).float().div_(255).unsqueeze(1)
     return grey.expand(-1, channels, -1, -1).contiguous(memory_format=torch.channels_last)
@@ -316,7 +310,6 @@ class YoloOptions:
 
     Raises:
         UsageError: ``start`` is a pickle that is not trusted.
-
     """
 
     model: str = "yolov5n.yaml"
@@ -365,7 +358,6 @@ def train_yolo(data: Path, mapper: str, output: Path, options: YoloOptions) -> P
 
     Raises:
         UsageError: The data set is missing, or ``output`` holds a run with other data or options.
-
     """
     config = data / f"{mapper}.yaml"
     if not config.exists():

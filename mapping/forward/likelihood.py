@@ -163,7 +163,7 @@ class RayScratch(NamedTuple):
         cells: Flat indices int64.
         transmittance: T_k float32, the probability that the ray reaches the cell.
         residual: (s_k - z) / sigma float32.
-        weight: float32, first T_k o_k times the likelihood of the measurement, then the responsibilities q_k.
+        weight: Float32, first T_k o_k times the likelihood of the measurement, then the responsibilities q_k.
     """
 
     cells: NDArray[np.int64]

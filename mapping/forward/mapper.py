@@ -105,7 +105,7 @@ class ForwardMapper:
 
         Args:
             resolution: Side of a cell (m).
-            bounds: x0, y0, x1, y1 (m) of the map; None: it grows with the scans.
+            bounds: X0, y0, x1, y1 (m) of the map; None: it grows with the scans.
             noise_std: Standard deviation of the range noise (m), held fixed; None: it is estimated.
             start_std: Its initial value (m) where it is estimated; None: what neighbouring beams show.
             threads: Number of threads; None: one for each available core.

@@ -23,7 +23,6 @@ def open_log(path: Path, recover: bool = False) -> LogSource:
 
     Raises:
         LogReadError: The file cannot be read, is damaged (unless ``recover``), or is no log of a known format.
-
     """
     from prim.log.mcap import McapReader  # when it is needed: writing a log does without it
 

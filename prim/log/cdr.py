@@ -23,7 +23,6 @@ class CdrReader:
 
     Raises:
         CdrError: The header is not plain CDR's; or, from any method, the message ends before the field does.
-
     """
 
     __slots__ = ("_at", "_data", "_order")
@@ -44,7 +43,6 @@ class CdrReader:
 
         Returns:
             The values.
-
         """
         at = self._at + (4 - self._at) % size
         try:
@@ -82,7 +80,6 @@ class CdrReader:
         Args:
             item_size: Bytes an item.
             alignment: Of the first item (bytes).
-
         """
         count = self.length(item_size)
         if count:

@@ -67,7 +67,6 @@ class McapReader:
 
     Raises:
         LogReadError: The file cannot be read, is damaged (unless ``recover``), or is no MCAP log.
-
     """
 
     def __init__(self, path: Path, recover: bool = False) -> None:

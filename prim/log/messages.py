@@ -59,12 +59,11 @@ class StampedPose(NamedTuple):
     """A pose as ROS messages hold it.
 
     Attributes:
-        stamp: ns.
+        stamp: Ns.
         frame_id: The frame that the pose is given in.
         child_frame_id: The frame whose pose it is; empty where the message does not say.
         translation: x, y, z (m).
         rotation: Unit quaternion x, y, z, w.
-
     """
 
     stamp: int
@@ -153,12 +152,11 @@ def encode_odometry(stamp: int, pose: Pose2D) -> bytes:
     """Encode a pose of ``base_link`` in ``odom``, and its covariance, as nav_msgs/Odometry without velocities.
 
     Args:
-        stamp: ns.
+        stamp: Ns.
         pose: The pose.
 
     Returns:
         The message.
-
     """
     zero = _new("geometry_msgs/msg/Vector3", x=0.0, y=0.0, z=0.0)
     message = _new(
@@ -179,13 +177,12 @@ def encode_pose(stamp: int, pose: Pose2D, frame_id: str = MAP_FRAME) -> bytes:
     """Encode a pose as geometry_msgs/PoseStamped.
 
     Args:
-        stamp: ns.
+        stamp: Ns.
         pose: The pose.
         frame_id: The frame that it is given in.
 
     Returns:
         The message.
-
     """
     return _serialize(_new(POSE_TYPE, header=_header(stamp, frame_id), pose=_pose(pose)))
 
@@ -194,14 +191,13 @@ def encode_point(stamp: int, x: float, y: float, frame_id: str = MAP_FRAME) -> b
     """Encode a GPS fix as geometry_msgs/PointStamped.
 
     Args:
-        stamp: ns.
-        x: m.
-        y: m.
+        stamp: Ns.
+        x: M.
+        y: M.
         frame_id: The frame that the point is given in.
 
     Returns:
         The message.
-
     """
     return _serialize(_new(POINT_TYPE, header=_header(stamp, frame_id), point=_point(x, y)))
 
@@ -210,12 +206,11 @@ def encode_compass(stamp: int, heading: float) -> bytes:
     """Encode a heading as geometry_msgs/Vector3Stamped: the direction of north (the map's +y) in the robot's frame.
 
     Args:
-        stamp: ns.
+        stamp: Ns.
         heading: Of the robot in the map frame (rad).
 
     Returns:
         The message.
-
     """
     north = _new("geometry_msgs/msg/Vector3", x=math.sin(heading), y=math.cos(heading), z=0.0)
     return _serialize(_new(VECTOR_TYPE, header=_header(stamp, BASE_FRAME), vector=north))
@@ -230,12 +225,11 @@ def encode_primitives(stamp: int, world: World) -> bytes:
     """Encode a world as visualization_msgs/MarkerArray: outlines to draw, kind and size as JSON in ``text``.
 
     Args:
-        stamp: ns.
+        stamp: Ns.
         world: The world.
 
     Returns:
         The message.
-
     """
     markers = [_primitive_marker(stamp, i, primitive) for i, primitive in enumerate(world.primitives)]
     if world.walls:
@@ -267,12 +261,11 @@ class StampedVector(NamedTuple):
     """A point or vector as ROS messages hold it.
 
     Attributes:
-        stamp: ns.
+        stamp: Ns.
         frame_id: The frame that it is given in.
         x: m, or latitude (degrees).
         y: m, or longitude (degrees).
         z: m, or altitude (m).
-
     """
 
     stamp: int
@@ -310,7 +303,6 @@ def decode_poses(type_name: str, data: bytes) -> list[StampedPose]:
 
     Raises:
         ValueError: The message is not of that type.
-
     """
     return POSE_DECODERS[type_name](CdrReader(data))
 

@@ -30,7 +30,6 @@ class RecordReader:
         stream: The file.
         path: Its path, for errors.
         recover: Pass over damaged chunks, instead of raising LogReadError.
-
     """
 
     def __init__(self, stream: IO[bytes], path: Path, recover: bool) -> None:
@@ -47,7 +46,6 @@ class RecordReader:
 
         Yields:
             The records.
-
         """
         for index in sorted(chunks, key=lambda index: index.chunk_start_offset):
             try:
@@ -66,7 +64,6 @@ class RecordReader:
 
         Yields:
             The records.
-
         """
         self._stream.seek(0)
         records = StreamReader(self._stream, emit_chunks=True, record_size_limit=RECORD_LIMIT).records
@@ -107,7 +104,6 @@ def read_chunk(stream: IO[bytes], index: ChunkIndex) -> Chunk:
 
     Returns:
         The chunk.
-
     """
     stream.seek(index.chunk_start_offset + RECORD_PREFIX)
     chunk: Chunk = Chunk.read(ReadDataStream(stream))

@@ -17,7 +17,6 @@ class Topic(NamedTuple):
         type: The type of its messages, by its ROS 2 name (package/msg/Type).
         encoding: How they are serialized: «cdr» for ROS 2.
         messages: The number of messages.
-
     """
 
     name: str
@@ -33,7 +32,6 @@ class Message(NamedTuple):
         topic: The name of its topic.
         log_time: When it was logged (ns).
         data: The serialized message.
-
     """
 
     topic: str
@@ -101,7 +99,6 @@ class LogSource(Protocol):
 
         Raises:
             LogReadError: A message is missing, damaged, or cannot be decoded.
-
         """
         ...
 
@@ -121,6 +118,5 @@ class LogSource(Protocol):
 
         Raises:
             LogReadError: As in :meth:`decoded`.
-
         """
         ...

@@ -28,7 +28,6 @@ class LogWriter:
 
     Raises:
         OutputError: The log cannot be written.
-
     """
 
     def __init__(self, path: Path) -> None:
@@ -74,7 +73,6 @@ class LogWriter:
         Args:
             name: Its name.
             values: Its entries.
-
         """
         self._writer.add_metadata(name, dict(values))
 
@@ -86,7 +84,6 @@ class LogWriter:
             media_type: Its MIME type.
             data: Its contents.
             stamp: When it was made (ns).
-
         """
         self._writer.add_attachment(stamp, stamp, name, media_type, data)
 
@@ -97,7 +94,6 @@ class LogWriter:
             topic: Its name.
             type_name: The type of its messages.
             latched: Whether its last message reaches late subscribers when the log is played back.
-
         """
         schema = self._writer.register_schema(type_name, "ros2msg", message_definition(type_name).encode())
         profile = _LATCHED_QOS if latched else "[]"
@@ -110,7 +106,6 @@ class LogWriter:
             topic: Its topic, which was announced.
             stamp: When it was logged and published (ns).
             data: The message in CDR.
-
         """
         try:
             self._writer.add_message(self._channels[topic], stamp, data, stamp)
