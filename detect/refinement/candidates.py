@@ -13,14 +13,14 @@ from numpy.typing import NDArray
 from detect.detection import Detection
 from detect.refinement.evidence import laplace_evidence, max_size
 from detect.refinement.fit import SPECIAL_CASES, KindFit, fit_all_kinds, refit, refit_same_kind
-from detect.refinement.geometry import TIES, parameters_of, primitive_of
+from detect.refinement.geometry import JACOBIANS, parameters_of, primitive_of
 from detect.refinement.map_cells import MapCells
 from detect.refinement.options import DEFAULTS, RefinementOptions
 from detect.refinement.rays import RayBundle
 from detect.refinement.sensor_model import (
     Background,
     BeamModel,
-    ClearanceMap,
+    DistanceMap,
     background_log_likelihood,
     with_background,
 )
@@ -65,14 +65,14 @@ class Candidate:
         self.current = self.start
 
     def rays_with_background(self, others: Sequence[Candidate], sensor: BeamModel) -> RayBundle:
-        """Set what its rays measure where they miss it: the map, walls and other candidates.
+        """Return its rays with what they measure where they miss it: the map, walls and other candidates.
 
         Args:
             others: All candidates; those far away, and itself, are passed over.
             sensor: The sensor.
 
         Returns:
-            Its rays.
+            Its rays, the rows OCCLUSION and BACKGROUND set.
         """
         background = self.background
         assert background is not None
@@ -99,7 +99,7 @@ class Candidate:
         if self.fits:
             return self.fits[0]
         kind = self.start.kind
-        return KindFit(kind, parameters_of(self.start), 0.0, np.eye(TIES[kind].shape[1]))
+        return KindFit(kind, parameters_of(self.start), 0.0, np.eye(JACOBIANS[kind].shape[1]))
 
     def is_possible(self, primitive: Primitive) -> bool:
         """Tell whether a primitive in its place keeps off walls and is no larger than the prior allows."""
@@ -155,6 +155,7 @@ def _fit_candidate(candidate: Candidate, bundle: RayBundle, search: bool, sensor
         fits = refit(candidate.fits, bundle, sensor, options.fit)
     possible = [fit for fit in fits if candidate.is_possible(primitive_of(fit.kind, fit.p))]
     evidence = {fit.kind: laplace_evidence(fit, options=options.evidence) for fit in possible or fits}
+    # the dispersion is left out here, and multiplies the limit: only the Occam factors differ from dividing by it
     ordered = sorted(possible or fits, key=lambda fit: -evidence[fit.kind])
     limit = evidence[ordered[0].kind] - options.evidence.out_of_question * sensor.dispersion
     likely = {kind for kind, value in evidence.items() if value > limit}
@@ -188,8 +189,8 @@ def find_backgrounds(pool: Executor, candidates: Sequence[Candidate], cells: Map
     walls = walls_behind(cells, shapes, [candidate.start for candidate in candidates])
     for wall in walls:
         occupied[wall.cells] = False
-    clearance = ClearanceMap.of(occupied, cells.frame)
-    found = pool.map(lambda candidate: clearance.background(candidate.bundle), candidates)
+    distances = DistanceMap.of(occupied, cells.frame)
+    found = pool.map(lambda candidate: distances.background(candidate.bundle), candidates)
     changed = []
     for candidate, background in zip(candidates, found, strict=True):
         limits = candidate.options.map

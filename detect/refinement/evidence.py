@@ -1,9 +1,13 @@
 """Model comparison: the evidence (marginal likelihood) of kinds, and the posterior of their parameters.
 
 The evidence is the likelihood integrated over the prior: a square that explains the rays as well as a rectangle does
-is the likelier kind, since it has a size less to choose (Occam's factor; MacKay 2003, chapter 28). It is first
-approximated by Laplace's method, and for the contenders computed by adaptive importance sampling from Student's t.
-The same samples give the posterior mean and covariance.
+is the likelier kind, since it has a size less to choose (Occam's factor; MacKay 2003, chapter 28). The prior is
+uniform over sizes and angles, equal for all kinds, and flat over positions, which cancels in ratios. Where scans have
+common errors the log-likelihood is divided by the dispersion (a power likelihood; Bissiri, Holmes and Walker 2016).
+
+The evidence is first approximated by Laplace's method, and for the contenders computed by adaptive importance
+sampling from Student's t. The samples of the last round, with tempered weights, give the posterior mean and
+covariance.
 """
 
 from __future__ import annotations
@@ -17,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from detect.refinement.fit import SPECIAL_CASES, KindFit
-from detect.refinement.geometry import NUMBERS, OUTLINES, TIES, primitive_of
+from detect.refinement.geometry import JACOBIANS, NUMBERS, OUTLINES, primitive_of
 from detect.refinement.kernels import (
     BACKGROUND,
     PARAMETERS,
@@ -72,6 +76,8 @@ def log_prior(kind: Kind, options: EvidenceOptions = DEFAULTS.evidence) -> float
 def laplace_evidence(fit: KindFit, dispersion: float = 1.0, options: EvidenceOptions = DEFAULTS.evidence) -> float:
     """Approximate a fit's log evidence by Laplace's method.
 
+    A Gaussian prior of 1 m and 1 rad around the fit keeps its volume finite where the rays leave a parameter open.
+
     Args:
         fit: The maximum-likelihood fit.
         dispersion: By which the log-likelihood is divided (quasi-likelihood; McCullagh and Nelder 1989).
@@ -94,8 +100,8 @@ class KindPosterior:
         mean: (K,).
         covariance: (K, K).
         log_evidence: Nats.
-        cost: Negative log-likelihood at the mean (nats).
-        effective_samples: Kish's effective sample size.
+        cost: Negative log-likelihood at the mean (nats), by :class:`SplitCost`.
+        effective_samples: Kish's effective sample size of the tempered weights.
     """
 
     mean: FloatArray
@@ -119,20 +125,20 @@ def importance_sample(
     Returns:
         The posterior; its log evidence is -inf where no sample is a shape that the prior allows.
     """
-    tie = TIES[fit.kind]
-    size = tie.shape[1]
-    own = tie / (tie**2).sum(axis=0)
+    jacobian = JACOBIANS[fit.kind]
+    size = jacobian.shape[1]
+    own = jacobian / (jacobian**2).sum(axis=0)
     at = fit.p @ own
     floor = np.array(options.min_std) @ own
     information = fit.information / sensor.dispersion + np.eye(size)
     mean, spread = at, _bounded(np.linalg.inv(information), fit.kind, floor, options)
-    wide = tie @ (options.sure_deviations**2 * spread) @ tie.T
+    wide = jacobian @ (options.sure_deviations**2 * spread) @ jacobian.T
     split = SplitCost.of(fit, wide, bundle, sensor, options)
     rounds = _draws(size, options)
     for count, (standard, log_density) in enumerate(rounds, start=1):
         lower = np.linalg.cholesky(spread)
         points = mean + standard @ lower.T
-        cost = split.costs(points @ tie.T)
+        cost = split.costs(points @ jacobian.T)
         log_weight = -cost / sensor.dispersion - log_density + np.log(np.diag(lower)).sum()
         if not np.isfinite(log_weight).any():
             return KindPosterior(at, spread, -math.inf, fit.cost, 0.0)
@@ -148,7 +154,7 @@ def importance_sample(
         mean,
         covariance + np.diag(floor**2) / 100,
         log_evidence,
-        float(split.costs((tie @ mean)[None])[0]),
+        float(split.costs((jacobian @ mean)[None])[0]),
         float(1 / (share**2).sum()),
     )
 
@@ -178,11 +184,11 @@ class SplitCost:
         sensor: BeamModel,
         options: EvidenceOptions = DEFAULTS.evidence,
     ) -> SplitCost:
-        """Split rays by whether they hit all shapes within a standard deviation of the fit.
+        """Split rays by whether they hit all shapes within a region around the fit.
 
         Args:
             fit: The fit.
-            covariance: (5, 5) of the shapes' parameters around it.
+            covariance: (5, 5) that describes the region: one standard deviation to each side.
             bundle: The rays.
             sensor: The sensor.
             options: The prior's bounds.
@@ -282,7 +288,7 @@ class Posterior:
         std: Standard deviations (m, rad) by parameter name.
         covariance: (K, K) in the same order.
         chances: Posterior probabilities of all kinds; they sum to 1.
-        cost: Negative log-likelihood of the primitive (nats).
+        cost: Negative log-likelihood of the primitive (nats), by :class:`SplitCost`.
     """
 
     primitive: Primitive
@@ -367,7 +373,7 @@ def summarize(kind: Kind, posterior: KindPosterior) -> tuple[Primitive, dict[str
     Returns:
         The primitive at the mean, standard deviations (m, rad) by name, and the covariance (K, K) in their order.
     """
-    primitive = primitive_of(kind, TIES[kind] @ posterior.mean)
+    primitive = primitive_of(kind, JACOBIANS[kind] @ posterior.mean)
     covariance = posterior.covariance
     if kind.longer_first and posterior.mean[3] < posterior.mean[4]:
         order = [0, 1, 2, 4, 3]

@@ -1,8 +1,9 @@
 """Maximum likelihood: kinds fitted to the rays of a candidate, from several starts each.
 
-The likelihood is rough and has several maxima (Levenberg and Marquardt's method finds the nearest one), so that every
-kind is fitted from starts that are turned and mirrored; its special cases, and what it is a special case of, start
-each other.
+The likelihood is rough and has several local maxima, of which Levenberg and Marquardt's method finds the nearest. So
+each kind is fitted from starts at several angles, and a fit of a special case (a square) starts the general kind (a
+rectangle) too. Jumps of the likelihood at silhouettes are smoothed by a blur that is reduced stage by stage
+(graduated optimisation).
 """
 
 from __future__ import annotations
@@ -13,7 +14,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from detect.refinement.geometry import NUMBERS, OUTLINES, TIES, parameters_of
+from detect.refinement.geometry import JACOBIANS, NUMBERS, OUTLINES, parameters_of
 from detect.refinement.kernels import PARAMETERS, Schedule, Starts, descend, negative_log_likelihoods
 from detect.refinement.options import DEFAULTS, Descent, FitOptions
 from detect.refinement.rays import RayBundle
@@ -22,7 +23,7 @@ from prim.arrays import FloatArray
 from prim.shapes import Kind, Primitive
 
 SPECIAL_CASES = {kind: kind.special_case for kind in Kind if kind.special_case is not None}
-"""For each kind with a special case (rectangle: square; ellipse: circle) that; both are fitted wherever one is."""
+"""The special case of each kind that has one: of a rectangle the square, of an ellipse the circle."""
 
 
 @dataclass(frozen=True)
@@ -32,7 +33,8 @@ class KindFit:
     Attributes:
         kind: The kind.
         p: (5,) the maximum-likelihood parameters x, y (m), theta (rad), width, height (m).
-        cost: Negative log-likelihood there (nats).
+        cost: Negative log-likelihood there (nats), up to a constant of the noise: with the last blur, and scaled from
+            the rays that were used to all of them.
         information: (K, K) on the kind's own parameters.
     """
 
@@ -96,8 +98,9 @@ def starts(guess: Primitive, kind: Kind) -> list[FloatArray]:
 def start_turns(kind: Kind, guessed: Kind) -> list[float]:
     """Choose the angles from a guess at which fits of a kind start.
 
-    Half of the symmetry where a quarter turn is covered by exchanging the sizes or by the symmetry itself, quarter
-    turns else; and where the guess is of this kind already, the turns that almost regular shapes confuse.
+    Two angles, half a period apart, for kinds that repeat after a quarter turn (or do so with both sizes exchanged);
+    the four quarter turns for all others. If the guess is of the same kind already, its almost regular shapes may
+    have been taken for each other, one regular period apart: these angles are added.
 
     Args:
         kind: The kind to fit.
@@ -170,7 +173,7 @@ def _ranked(
 def refit(
     fits: Sequence[KindFit], bundle: RayBundle, sensor: BeamModel, options: FitOptions = DEFAULTS.fit
 ) -> list[KindFit]:
-    """Fit kinds to all rays from earlier fits, beside their special cases and what they are special cases of.
+    """Fit kinds to all rays from earlier fits, and general kinds from fits of their special cases.
 
     Args:
         fits: The earlier fits.
@@ -290,15 +293,15 @@ def _fit_each(
     """Fit from each start to a subset of the rays; cost and information are scaled to all rays."""
     if not begin:
         return []
-    ties = np.zeros((len(begin), PARAMETERS, PARAMETERS))
-    sizes = np.array([TIES[kind].shape[1] for kind, _ in begin])
-    for tie, size, (kind, _) in zip(ties, sizes.tolist(), begin, strict=True):
-        tie[:, :size] = TIES[kind]
+    jacobians = np.zeros((len(begin), PARAMETERS, PARAMETERS))
+    sizes = np.array([JACOBIANS[kind].shape[1] for kind, _ in begin])
+    for jacobian, size, (kind, _) in zip(jacobians, sizes.tolist(), begin, strict=True):
+        jacobian[:, :size] = JACOBIANS[kind]
     shapes, cost = np.stack([p for _, p in begin]), np.empty(len(begin))
-    information = np.zeros_like(ties)
+    information = np.zeros_like(jacobians)
     numbers = np.array([NUMBERS[kind] for kind, _ in begin])
     schedule = _schedule(descent, subset.stride, sensor, options)
-    batch = Starts(numbers, shapes, ties, sizes)
+    batch = Starts(numbers, shapes, jacobians, sizes)
     descend(OUTLINES, batch, sensor.data(subset.bundle), schedule, cost, information)
     cost, information = subset.stride * cost, subset.stride * information
     return [

@@ -1,4 +1,4 @@
-"""Primitives as the kernels take them: parameters, outlines, and the ties between them."""
+"""Primitives as the kernels take them: parameters, outlines, and the kinds' own parameters."""
 
 from __future__ import annotations
 
@@ -46,15 +46,15 @@ OUTLINES = _outlines()
 """The unit outlines of all kinds."""
 
 
-def _tie(kind: Kind) -> FloatArray:
+def _jacobian(kind: Kind) -> FloatArray:
     full = np.eye(PARAMETERS)
     columns = [full[0], full[1], *([full[2]] if kind.has_angle else [])]
     columns += [full[3] + full[4]] if kind.is_tied else [full[3], full[4]]
     return np.column_stack(columns)
 
 
-TIES = {kind: _tie(kind) for kind in Kind}
-"""For each kind the matrix (5, K) that maps its own parameters to x, y, theta, width, height."""
+JACOBIANS = {kind: _jacobian(kind) for kind in Kind}
+"""For each kind the constant Jacobian (5, K) of x, y, theta, width, height by its own parameters."""
 
 
 def parameters_of(primitive: Primitive) -> FloatArray:

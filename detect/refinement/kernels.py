@@ -8,9 +8,10 @@ that misses has that of the background. At s = 0 the likelihood jumps, so that i
 step of half-width ``blur`` (m) blends both over -blur < s < blur; fits reduce it as they converge. With ``blur`` 0
 the likelihood is exact.
 
-Kinds with tied sizes (square, circle) or without an angle have fewer parameters of their own; a matrix (5, K) maps
-those to the five. What a kind's outline is comes in as an argument, :class:`Outlines`: compiled code is cached beside
-this file and made anew when this file alone changes, so that nothing that stands elsewhere may be compiled in.
+Kinds with tied sizes (square, circle) or without an angle have fewer parameters of their own; the Jacobian (5, K) of
+the five by those is constant. What a kind's outline is comes in as an argument, :class:`Outlines`: compiled code is
+cached beside this file and made anew when this file alone changes, so that nothing that stands elsewhere may be
+compiled in.
 """
 
 from __future__ import annotations
@@ -58,9 +59,11 @@ ORIGIN_X, ORIGIN_Y, DIRECTION_X, DIRECTION_Y, RANGE, OCCLUSION, BACKGROUND = ran
 range (m) from which on something else occludes the shape; the log-likelihood of the measurement by the background.
 """
 
-NEAREST, MAX_RANGE = 7, 8
+ENTRY_RANGE, MAX_RANGE = 7, 8
 COLLECTED_ROWS = 9
-"""Further rows while rays are collected: the range (m) at which they come near, and the sensor's largest one (m)."""
+"""Further rows while rays are collected: the range (m) at which they enter the candidate's circle, and the sensor's
+largest one (m).
+"""
 
 MEASURED, TOO_NEAR, NO_RETURN, INVALID = 0, 1, 2, 3
 """Outcomes of a beam, as prim.scan.RangeOutcome; the first three are rows of the table of log-likelihoods."""
@@ -129,14 +132,14 @@ class Intersections(NamedTuple):
 class Starts(NamedTuple):
     """The starts of M fits.
 
-    The kinds' ``numbers`` (M,); ``shapes`` (M, 5), parameters that a fit changes in place; ``ties`` (M, 5, 5), the
-    matrices from the kinds' own parameters to the five; ``sizes`` (M,), how many own parameters there are.
+    The kinds' ``numbers`` (M,); ``shapes`` (M, 5), parameters that a fit changes in place; ``jacobians`` (M, 5, 5),
+    the derivatives of the five parameters by the kinds' own; ``counts`` (M,), how many own parameters there are.
     """
 
     numbers: NDArray[np.int64]
     shapes: FloatArray
-    ties: FloatArray
-    sizes: NDArray[np.int64]
+    jacobians: FloatArray
+    counts: NDArray[np.int64]
 
 
 class Schedule(NamedTuple):
@@ -166,8 +169,8 @@ def _normal() -> tuple[NDArray[np.float64], ...]:
 
 def upper_tail(cut: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the probability (N,) that a standard normal variable exceeds each ``cut`` (N,)."""
-    x, _, above = _normal()
-    return np.interp(cut, x, above)
+    x, _, upper = _normal()
+    return np.interp(cut, x, upper)
 
 
 def likelihood_table(outlier: float) -> FloatArray:
@@ -182,9 +185,9 @@ def likelihood_table(outlier: float) -> FloatArray:
     Returns:
         (6, 2 * TABLE_REACH * TABLE_SPACING + 1).
     """
-    x, density, below = _normal()
+    x, density, upper = _normal()
     phi = density / math.sqrt(2 * math.pi)
-    measured, near, far = density + outlier, below + outlier, below[::-1] + outlier
+    measured, near, far = density + outlier, upper + outlier, upper[::-1] + outlier
     slopes = [-x * density / measured, -phi / near, phi / far]
     return np.stack([np.log(measured), np.log(near), np.log(far), *slopes])
 
@@ -652,7 +655,7 @@ def append_passing(
         if abs(dx * away_y - dy * away_x) < reach and ahead > -reach and outcomes[i] != INVALID:
             rays[ORIGIN_X, size], rays[ORIGIN_Y, size] = pose[0], pose[1]
             rays[DIRECTION_X, size], rays[DIRECTION_Y, size] = dx, dy
-            rays[RANGE, size], rays[NEAREST, size], rays[MAX_RANGE, size] = z[i], ahead - reach, scan[0]
+            rays[RANGE, size], rays[ENTRY_RANGE, size], rays[MAX_RANGE, size] = z[i], ahead - reach, scan[0]
             store.outcomes[size], store.scan[size] = outcomes[i], scan[1]
             size += 1
     return size
@@ -748,8 +751,8 @@ def standardized_clearances(outlines: Any, k: int, p: Any, covariance: Any, rays
         covariance: (5, 5) of the parameters.
         rays: (7, N).
         blur: Half-width of the footprint (m).
-        out: (N,) gets the clearances: below 0 for a miss, 0 where the footprint meets an edge, -FAR where a ray is
-            occluded before it comes to the shape.
+        out: (N,) gets the clearances: below 0 for a miss, 0 where the footprint meets an edge, -FAR where the shape
+            lies behind a ray or is occluded from it.
     """
     heading = math.cos(p[THETA]), math.sin(p[THETA])
     form = outlines.form[k]
@@ -783,10 +786,8 @@ def _partition(
     hit, edge, missed = 0, 0, 0.0
     for i in range(count):
         occluded = ranges[i] >= occlusions[i]
-        full, some = (
-            clearances[i] >= blur and clearances[i] > 0.0 and not occluded,
-            clearances[i] > -blur and not occluded,
-        )
+        full = clearances[i] >= blur and clearances[i] > 0.0 and not occluded
+        some = clearances[i] > -blur and not occluded
         hits[hit] = i
         hit += full
         edges[edge] = i
@@ -813,9 +814,9 @@ def negative_log_likelihoods(outlines: Any, numbers: Any, samples: Any, data: An
     out[:] = 0.0
     for first in range(0, len(outcomes), BLOCK):
         count = min(BLOCK, len(outcomes) - first)
-        for k in range(len(samples)):
+        for m in range(len(samples)):
             met = Intersections(ranges, clearances, scratch)
-            _intersect(outlines, numbers[k], samples[k], rays, (first, count), met)
+            _intersect(outlines, numbers[m], samples[m], rays, (first, count), met)
             hit, edge, total = _partition(rays, first, ranges, clearances, blur, hits, edges, count)
             for n in range(hit):
                 i = hits[n]
@@ -825,9 +826,9 @@ def negative_log_likelihoods(outlines: Any, numbers: Any, samples: Any, data: An
                 i = edges[n]
                 x = (max(ranges[i], 0.0) - rays[RANGE, first + i]) / sigma
                 share = _hit_fraction(clearances[i], blur)
-                hit_chance = math.exp(_lookup(table, outcomes[first + i], x))
-                total += math.log(share * hit_chance + (1.0 - share) * math.exp(rays[BACKGROUND, first + i]))
-            out[k] -= total
+                hit_likelihood = math.exp(_lookup(table, outcomes[first + i], x))
+                total += math.log(share * hit_likelihood + (1.0 - share) * math.exp(rays[BACKGROUND, first + i]))
+            out[m] -= total
 
 
 def _gradient(  # noqa: C901 - one pass over the rays
@@ -835,7 +836,10 @@ def _gradient(  # noqa: C901 - one pass over the rays
 ) -> float:
     """Compute the negative log-likelihood of all rays, its gradient, and the information.
 
-    The information is Gauss and Newton's for rays that hit, and the squared score for rays at silhouettes.
+    The information is Gauss and Newton's for measured ranges that hit (an outlier's weight is less, as in iteratively
+    reweighted least squares), and the squared score for censored ones (Berndt, Hall, Hall and Hausman 1974). At
+    silhouettes it is the sum of the former, weighted by the probability that the ray hit, and of the squared score of
+    the clearance.
 
     Args:
         outlines: The kinds' outlines.
@@ -854,8 +858,8 @@ def _gradient(  # noqa: C901 - one pass over the rays
     ranges, clearances, scratch = np.empty(BLOCK), np.empty(BLOCK), np.empty((SCRATCH_ROWS, BLOCK))
     hits, edges = np.empty(BLOCK + 1, np.int64), np.empty(BLOCK + 1, np.int64)
     hitting, dr = np.empty((RANGE, BLOCK)), np.empty((PARAMETERS, BLOCK))
-    slope, curvature = np.empty(BLOCK), np.empty(BLOCK)
-    moved, slid, score = np.zeros(PARAMETERS), np.zeros(PARAMETERS), np.zeros(PARAMETERS)
+    range_scores, curvature = np.empty(BLOCK), np.empty(BLOCK)
+    by_range, by_clearance, score = np.zeros(PARAMETERS), np.zeros(PARAMETERS), np.zeros(PARAMETERS)
     gradient[:] = 0.0
     information[:] = 0.0
     heading = math.cos(p[THETA]), math.sin(p[THETA])
@@ -869,8 +873,8 @@ def _gradient(  # noqa: C901 - one pass over the rays
             i = first + hits[n]
             x = (max(ranges[hits[n]], 0.0) - rays[RANGE, i]) / sigma
             total += _lookup(table, outcomes[i], x)
-            slope[n] = _lookup(table, 3 + outcomes[i], x) / sigma
-            curvature[n] = _range_information(outcomes[i], slope[n], x, sigma)
+            range_scores[n] = _lookup(table, 3 + outcomes[i], x) / sigma
+            curvature[n] = _range_information(outcomes[i], range_scores[n], x, sigma)
             for row in range(RANGE):
                 hitting[row, n] = rays[row, i]
         if form == POLYGON:
@@ -878,30 +882,30 @@ def _gradient(  # noqa: C901 - one pass over the rays
         else:
             _range_gradients(form, p, hitting, hit, dr)
         for a in range(PARAMETERS):
-            gradient[a] -= _weighted_sum(slope, dr[a], dr[a], hit, False)
+            gradient[a] -= _weighted_sum(range_scores, dr[a], dr[a], hit, False)
             for b in range(a + 1):
                 information[a, b] += _weighted_sum(curvature, dr[a], dr[b], hit, True)
         for n in range(edge):
             i = first + edges[n]
             if form == POLYGON:
-                at, aside = _polygon_with_gradient((outlines, k), p, heading, rays, i, blur, (moved, slid))
+                at, aside = _polygon_with_gradient((outlines, k), p, heading, rays, i, blur, (by_range, by_clearance))
             else:
-                at, aside = _form_with_gradient(form, p, heading, rays, i, blur, (moved, slid))
+                at, aside = _form_with_gradient(form, p, heading, rays, i, blur, (by_range, by_clearance))
             x = (max(at, 0.0) - rays[RANGE, i]) / sigma
             share = _hit_fraction(aside, blur)
-            hit_chance, miss_chance = math.exp(_lookup(table, outcomes[i], x)), math.exp(rays[BACKGROUND, i])
-            likelihood = share * hit_chance + (1.0 - share) * miss_chance
+            hit_likelihood, miss_likelihood = math.exp(_lookup(table, outcomes[i], x)), math.exp(rays[BACKGROUND, i])
+            likelihood = share * hit_likelihood + (1.0 - share) * miss_likelihood
             total += math.log(likelihood)
-            responsibility = share * hit_chance / likelihood
-            downhill = _lookup(table, 3 + outcomes[i], x) / sigma
-            known = responsibility * _range_information(outcomes[i], downhill, x, sigma)
+            responsibility = share * hit_likelihood / likelihood
+            range_score = _lookup(table, 3 + outcomes[i], x) / sigma
+            weight_of_range = responsibility * _range_information(outcomes[i], range_score, x, sigma)
             u = 0.5 * (aside / blur + 1.0)
-            step = (hit_chance - miss_chance) / likelihood * 3.0 * u * (1.0 - u) / blur
+            step = (hit_likelihood - miss_likelihood) / likelihood * 3.0 * u * (1.0 - u) / blur
             for a in range(PARAMETERS):
-                score[a] = step * slid[a]
-                gradient[a] -= responsibility * downhill * moved[a] + score[a]
+                score[a] = step * by_clearance[a]
+                gradient[a] -= responsibility * range_score * by_range[a] + score[a]
                 for b in range(a + 1):
-                    information[a, b] += known * moved[a] * moved[b] + score[a] * score[b]
+                    information[a, b] += weight_of_range * by_range[a] * by_range[b] + score[a] * score[b]
     for a in range(PARAMETERS):
         for b in range(a):
             information[b, a] = information[a, b]
@@ -925,7 +929,8 @@ def _weighted_sum(weight: Any, first: Any, second: Any, count: int, both: bool) 
 def _range_information(outcome: int, slope: float, x: float, sigma: float) -> float:
     """Return the information (1 / m²) of a ray that hits on its range; ``slope`` is its log-likelihood's derivative.
 
-    Of a measured range the slope is -x times the share that is no outlier: what is left of it over x.
+    Of a measured range the slope is -x / sigma times the probability that it is no outlier; the information is that
+    probability over sigma².
     """
     if outcome != MEASURED:
         return slope * slope
@@ -962,26 +967,26 @@ def _solve_damped(matrix: Any, vector: Any, damping: float, out: Any, lower: Any
 
 
 @part
-def _project(tie: Any, size: int, gradient: Any, full: Any, downhill: Any, information: Any) -> None:
+def _project(jacobian: Any, size: int, gradient: Any, full: Any, downhill: Any, information: Any) -> None:
     """Set a kind's own downhill direction (K,) and information (K, K) from those of the five parameters."""
     for k in range(size):
         downhill[k] = 0.0
         for a in range(PARAMETERS):
-            downhill[k] -= tie[a, k] * gradient[a]
+            downhill[k] -= jacobian[a, k] * gradient[a]
         for m in range(size):
             information[k, m] = 0.0
             for a in range(PARAMETERS):
                 for b in range(PARAMETERS):
-                    information[k, m] += tie[a, k] * full[a, b] * tie[b, m]
+                    information[k, m] += jacobian[a, k] * full[a, b] * jacobian[b, m]
 
 
 @part
-def _step(p: Any, tie: Any, size: int, change: Any, schedule: Any, trial: Any) -> None:
+def _step(p: Any, jacobian: Any, size: int, change: Any, schedule: Any, trial: Any) -> None:
     """Set the parameters after a change (K,) of a kind's own; a size is no more than halved or doubled."""
     for a in range(PARAMETERS):
         trial[a] = p[a]
         for k in range(size):
-            trial[a] += tie[a, k] * change[k]
+            trial[a] += jacobian[a, k] * change[k]
     for a in (WIDTH, HEIGHT):
         trial[a] = min(max(trial[a], 0.5 * p[a], schedule.min_size), 2 * p[a], schedule.max_size)
 
@@ -998,16 +1003,16 @@ def descend(outlines: Any, starts: Any, data: Any, schedule: Any, cost: Any, inf
         cost: (M,) gets the costs (nats) at the last blur.
         information: (M, 5, 5) gets the information on own parameters.
     """
-    numbers, shapes, ties, sizes = starts
-    for k in range(len(shapes)):
-        cost[k] = _descend_one(outlines, numbers[k], shapes[k], ties[k], sizes[k], data, schedule, information[k])
+    numbers, shapes, jacobians, counts = starts
+    for m in range(len(shapes)):
+        start = shapes[m], jacobians[m], counts[m]
+        cost[m] = _descend_one(outlines, numbers[m], start, data, schedule, information[m])
 
 
 @part
-def _descend_one(
-    outlines: Any, number: int, p: Any, tie: Any, size: int, data: Any, schedule: Any, information: Any
-) -> float:
-    """As :func:`descend`, of one shape; returns its cost (nats)."""
+def _descend_one(outlines: Any, number: int, start: Any, data: Any, schedule: Any, information: Any) -> float:
+    """As :func:`descend`, of one start: its shape, Jacobian and count; returns its cost (nats)."""
+    p, jacobian, size = start
     gradient, full = np.zeros(PARAMETERS), np.zeros((PARAMETERS, PARAMETERS))
     other_gradient, other_full = np.zeros(PARAMETERS), np.zeros((PARAMETERS, PARAMETERS))
     downhill, change, lower = np.zeros(size), np.zeros(size), np.zeros((size, size))
@@ -1030,15 +1035,15 @@ def _descend_one(
                     break
             else:
                 damping *= 8
-            _project(tie, size, gradient, full, downhill, information)
+            _project(jacobian, size, gradient, full, downhill, information)
             while damping < schedule.max_damping and not _solve_damped(
                 information, downhill, damping, change, lower, size
             ):
                 damping = max(10 * damping, 1e-3)
             if damping > schedule.max_damping:
                 break
-            _step(p, tie, size, change, schedule, trial)
+            _step(p, jacobian, size, change, schedule, trial)
     if blurs[-1] < schedule.information_blur:
         _gradient_part(outlines, number, p, data, schedule.information_blur, gradient, full)
-    _project(tie, size, gradient, full, downhill, information)
+    _project(jacobian, size, gradient, full, downhill, information)
     return cost

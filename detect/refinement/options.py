@@ -103,7 +103,7 @@ class FitOptions:
     information_blur: float = 0.001
     """m; information of silhouettes is asked with this blur at least: at narrower ones single jumps count for all."""
     hopeless_kind: float = 60.0
-    """nats; a kind whose coarse fit is less likely by this much than the best is not fitted to all rays."""
+    """nats; a kind whose coarse fit is less likely by this much than the best is not fitted to more rays."""
     hopeless_start: float = 20.0
     """nats; nor is another fit of one kind."""
     starts_kept: int = 2
@@ -256,8 +256,8 @@ class ProposalOptions:
 class AcceptanceOptions:
     """What a candidate needs to be a detection."""
 
-    min_gain: float = 25.0
-    """nats; log-likelihood gain of the rays over an empty place."""
+    min_log_ratio: float = 25.0
+    """nats; log-likelihood ratio of the rays against nothing in its place."""
     max_misfit: float = 0.25
     """nats a ray; by which the map alone explains the rays that meet it better."""
     max_relative_std: float = 0.25
@@ -273,7 +273,8 @@ class AcceptanceOptions:
     max_shared: float = 0.25
     """Two candidates that share more of the smaller one's area are duplicates."""
     preference: float = 1.5
-    """Of duplicates one that the networks found wins against others whose gain is larger by a smaller factor."""
+    """Of duplicates one that the networks found wins unless another's log-likelihood ratio is larger by this factor.
+    """
     sure: float = 0.95
     """A detection of an earlier pass whose kind has this posterior probability keeps it."""
 

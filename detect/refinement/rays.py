@@ -13,8 +13,8 @@ from detect.refinement.geometry import passes_within
 from detect.refinement.kernels import (
     BACKGROUND,
     COLLECTED_ROWS,
+    ENTRY_RANGE,
     FAR,
-    NEAREST,
     OCCLUSION,
     RayStoreView,
     append_passing,
@@ -37,14 +37,14 @@ class RayBundle:
     Attributes:
         rays: (7, N) as detect.refinement.kernels has them.
         outcomes: (N,) MEASURED, TOO_NEAR or NO_RETURN.
-        nearest: (N,) range (m) at which they come near the candidate.
+        entry_range: (N,) range (m) at which they enter the candidate's circle.
         max_range: (N,) the sensor's (m).
         scan: (N,) number of the scan.
     """
 
     rays: FloatArray
     outcomes: NDArray[np.int8]
-    nearest: FloatArray
+    entry_range: FloatArray
     max_range: FloatArray
     scan: NDArray[np.int32]
 
@@ -88,7 +88,7 @@ class RayBundle:
         return RayBundle(
             np.ascontiguousarray(self.rays[:, chosen]),
             np.ascontiguousarray(self.outcomes[chosen]),
-            self.nearest[chosen],
+            self.entry_range[chosen],
             self.max_range[chosen],
             self.scan[chosen],
         )
@@ -130,7 +130,7 @@ class RayBuffer:
         """Return all rays so far."""
         rays = self.view.rays[:, : self.size].copy()
         outcomes, scan = self.view.outcomes[: self.size].copy(), self.view.scan[: self.size].copy()
-        return RayBundle(rays[:NEAREST], outcomes, rays[-2], rays[-1], scan)
+        return RayBundle(rays[:ENTRY_RANGE], outcomes, rays[-2], rays[-1], scan)
 
 
 class RayCollector:

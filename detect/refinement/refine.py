@@ -32,7 +32,7 @@ from detect.refinement.options import DEFAULTS, AcceptanceOptions, RefinementOpt
 from detect.refinement.proposals import propose
 from detect.refinement.rays import RayBundle, collect_rays
 from detect.refinement.sensor_estimation import estimate_noise, estimate_sensor, initial_noise
-from detect.refinement.sensor_model import Background, BeamModel, ClearanceMap, surface_likelihood
+from detect.refinement.sensor_model import Background, BeamModel, DistanceMap, surface_likelihood
 from mapping.grid import OccupancyGrid
 from prim.arrays import FloatArray
 from prim.scan import Scan
@@ -49,7 +49,7 @@ class RefinedPrimitive:
         std: Standard deviations (m, rad) by name: x, y, theta and the sizes.
         covariance: (K, K) in the same order.
         chances: Posterior probabilities of the kinds.
-        gain: Log-likelihood gain of the rays over an empty place (nats).
+        log_ratio: Log-likelihood ratio of the rays against nothing in its place (nats).
         misfit: By how much the map alone explains the rays that meet it better (nats a ray).
         rays: How many rays meet it.
         seen: Share of the directions around it in which they do.
@@ -59,7 +59,7 @@ class RefinedPrimitive:
     std: Mapping[str, float]
     covariance: FloatArray
     chances: Mapping[Kind, float]
-    gain: float
+    log_ratio: float
     misfit: float
     rays: int
     seen: float
@@ -119,7 +119,7 @@ def refine_detections(
 
     Returns:
         What the rays support, likeliest kinds first, and what they do not, with the reasons; and the noise (m), None
-        where no ray passes any candidate.
+        where nothing is supported.
     """
     cells = MapCells.of(grid, options.map)
     wanted, undecided = _candidates_of(detections, cells, effort, options)
@@ -209,8 +209,10 @@ def rejection_reason(result: RefinedPrimitive | None, limits: AcceptanceOptions 
     """
     if result is None:
         return "no ray passes it, a likelier one stands in its place, or it is too large or reaches into a wall"
-    if result.gain < limits.min_gain:
-        return f"the rays are likelier with it by {result.gain:.0f} nats only, less than {limits.min_gain:g}"
+    if result.log_ratio < limits.min_log_ratio:
+        return (
+            f"the rays are likelier with it by {result.log_ratio:.0f} nats only, less than {limits.min_log_ratio:g}"
+        )
     if result.misfit > limits.max_misfit:
         better = f"{result.misfit:.2f} nats each in the map alone, more than {limits.max_misfit:g}"
         return f"its rays are likelier by {better}"
@@ -296,7 +298,8 @@ class Refinement:
             primitives: The guesses.
             scans: The scans and the poses of their laser, in the map frame.
             known: By index, detections whose kind is not asked again.
-            preferred: Of duplicates the first so many win against others that explain the rays little better.
+            preferred: Of duplicates the first so many win against others whose log-likelihood ratio is not larger by
+                ``options.acceptance.preference``.
 
         Returns:
             Each refined, in the order given; None for one that no ray passes, that is the duplicate of another, or
@@ -336,7 +339,7 @@ class Refinement:
         disperses = sensor.dispersion > options.sensor.significant_dispersion
         fit_candidates(pool, single, [disperses] * len(single), sensor)
         self.noise_std = sensor.std
-        whole_map = ClearanceMap.of(self.cells.occupied, self.cells.frame)
+        whole_map = DistanceMap.of(self.cells.occupied, self.cells.frame)
         finished = pool.map(lambda item: finish(item, whole_map.background(item.bundle), sensor), single)
         return {id(candidate): result for candidate, result in zip(single, finished, strict=True)}
 
@@ -361,30 +364,30 @@ class Refinement:
 def without_duplicates(
     candidates: Sequence[Candidate], preferred: Sequence[Candidate], sensor: BeamModel
 ) -> list[Candidate]:
-    """Remove candidates that stand where one with a larger gain does.
+    """Remove candidates that stand where one with a larger log-likelihood ratio does.
 
     Args:
         candidates: The fitted candidates.
-        preferred: Those that win against others whose gain is little larger.
+        preferred: Those whose ratio is multiplied by ``options.acceptance.preference`` for the comparison.
         sensor: The sensor.
 
     Returns:
-        The rest, largest gain first.
+        The rest, largest ratio first.
     """
-    gains = {id(candidate): gain_of(candidate, candidates, sensor) for candidate in candidates}
+    ratios = {id(candidate): log_ratio_of(candidate, candidates, sensor) for candidate in candidates}
     for candidate in preferred:
-        if id(candidate) in gains:
-            gains[id(candidate)] *= candidate.options.acceptance.preference
+        if id(candidate) in ratios:
+            ratios[id(candidate)] *= candidate.options.acceptance.preference
     stay: list[Candidate] = []
-    for candidate in sorted(candidates, key=lambda item: -gains[id(item)]):
+    for candidate in sorted(candidates, key=lambda item: -ratios[id(item)]):
         limit = candidate.options.acceptance.max_shared
         if all(shared_area(candidate.current, other.current) <= limit for other in stay):
             stay.append(candidate)
     return stay
 
 
-def gain_of(candidate: Candidate, others: Sequence[Candidate], sensor: BeamModel) -> float:
-    """Compute the log-likelihood gain of the rays over nothing in a candidate's place.
+def log_ratio_of(candidate: Candidate, others: Sequence[Candidate], sensor: BeamModel) -> float:
+    """Compute the log-likelihood ratio of the rays with a candidate against nothing in its place.
 
     Args:
         candidate: The candidate.
@@ -415,7 +418,7 @@ def finish(candidate: Candidate, map_alone: Background, sensor: BeamModel) -> Re
     posterior = compare_kinds(candidate.fits, bundle, sensor, candidate.is_possible, evidence)
     if posterior is None:
         return None
-    gain = float(-bundle.rays[BACKGROUND].sum() - posterior.cost)
+    ratio = float(-bundle.rays[BACKGROUND].sum() - posterior.cost)
     sectors = candidate.options.acceptance.sectors
     misfit, rays, seen = _compare_with_map(posterior.primitive, bundle, map_alone, sensor, sectors)
     chances = candidate.known.kind_probabilities if candidate.known is not None else None
@@ -424,7 +427,7 @@ def finish(candidate: Candidate, map_alone: Background, sensor: BeamModel) -> Re
         posterior.std,
         posterior.covariance,
         chances or posterior.chances,
-        gain,
+        ratio,
         misfit,
         rays,
         seen,
@@ -434,14 +437,14 @@ def finish(candidate: Candidate, map_alone: Background, sensor: BeamModel) -> Re
 def _compare_with_map(
     primitive: Primitive, bundle: RayBundle, map_alone: Background, sensor: BeamModel, sectors: int
 ) -> tuple[float, int, float]:
-    """Return of the rays that meet a primitive the misfit (nats a ray), how many they are, and ``seen``."""
+    """Return the misfit (nats a ray), the number of rays that meet a primitive, and the share of directions seen."""
     ranges = ranges_to(primitive, bundle.rays)
     meets = ranges < bundle.rays[OCCLUSION]
     if not meets.any():
         return 0.0, 0, 0.0
     met, cells = bundle.select(meets), map_alone.select(meets)
     own = np.log(surface_likelihood(met, ranges[meets], np.ones(len(met), np.bool_), 0.0, sensor))
-    free = np.log(surface_likelihood(met, cells.ranges, cells.ends, cells.uncertainty, sensor))
+    free = np.log(surface_likelihood(met, cells.ranges, cells.hits_map, cells.uncertainty, sensor))
     x, y = met.rays[:2] + ranges[meets] * met.rays[2:4] - [[primitive.x], [primitive.y]]
     sector = np.floor(np.arctan2(y, x) / (2 * math.pi) * sectors).astype(int) % sectors
     return float((free - own).mean()), len(met), len(np.unique(sector)) / sectors

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from detect.refinement.candidates import Candidate
 from detect.refinement.evidence import exact_costs
-from detect.refinement.geometry import NUMBERS, OUTLINES, TIES, ranges_to
+from detect.refinement.geometry import JACOBIANS, NUMBERS, OUTLINES, ranges_to
 from detect.refinement.kernels import MEASURED, OCCLUSION, PARAMETERS, RANGE, gradient, upper_tail
 from detect.refinement.options import DEFAULTS, SensorOptions
 from detect.refinement.rays import RayBundle
@@ -24,7 +24,7 @@ NORMAL_MAD = 1.4826
 
 
 def initial_noise(candidates: Sequence[Candidate], options: SensorOptions = DEFAULTS.sensor) -> float:
-    """Estimate the noise before any fit, robustly: the median absolute residual from the guesses' surfaces.
+    """Estimate the noise before any fit, robustly: the scaled median absolute residual from the guesses' surfaces.
 
     Args:
         candidates: The candidates.
@@ -75,7 +75,7 @@ def estimate_footprint(candidates: Sequence[Candidate], sensor: BeamModel) -> fl
         sensor: The sensor.
 
     Returns:
-        Metres; 0 where the best one is not clearly above it.
+        Metres; 0 where one of the two smallest is the best.
     """
     footprints = sensor.options.footprints
     widest = footprints[-1]
@@ -91,7 +91,7 @@ def estimate_footprint(candidates: Sequence[Candidate], sensor: BeamModel) -> fl
 
 
 def scan_dispersion(candidates: Sequence[Candidate], sensor: BeamModel) -> float:
-    """Estimate the dispersion of scans: the factor by which mean residuals of scans scatter beyond independent rays.
+    """Estimate the dispersion of scans: the variance of their mean residuals over that of independent rays.
 
     Args:
         candidates: The fitted candidates.
@@ -159,12 +159,12 @@ def _scan_scores(candidate: Candidate, bundle: RayBundle, sensor: BeamModel) -> 
     Independent rays give each a mean square of 1 / S. None where the information is singular.
     """
     fit = candidate.fits[0]
-    tie, blur = TIES[fit.kind], max(sensor.footprint, sensor.options.min_score_blur)
+    jacobian, blur = JACOBIANS[fit.kind], max(sensor.footprint, sensor.options.min_score_blur)
 
     def score_and_information(part: RayBundle) -> tuple[FloatArray, FloatArray]:
         slope, information = np.zeros(PARAMETERS), np.zeros((PARAMETERS, PARAMETERS))
         gradient(OUTLINES, NUMBERS[fit.kind], fit.p, sensor.data(part), blur, slope, information)
-        return tie.T @ slope, tie.T @ information @ tie
+        return jacobian.T @ slope, jacobian.T @ information @ jacobian
 
     try:
         whiten = np.linalg.inv(np.linalg.cholesky(score_and_information(bundle)[1]))
@@ -177,8 +177,8 @@ def _scan_scores(candidate: Candidate, bundle: RayBundle, sensor: BeamModel) -> 
 
 def _without_truncation(error: FloatArray, cut: FloatArray) -> FloatArray:
     """Standardise errors (N,) of normal distributions that are truncated below ``cut`` (N,) to mean 0, variance 1."""
-    tail = np.exp(-(cut**2) / 2) / math.sqrt(2 * math.pi) / upper_tail(cut)
-    return np.asarray((error - tail) / np.sqrt(1 + cut * tail - tail**2))
+    mills = np.exp(-(cut**2) / 2) / math.sqrt(2 * math.pi) / upper_tail(cut)  # inverse Mills ratio
+    return np.asarray((error - mills) / np.sqrt(1 + cut * mills - mills**2))
 
 
 def estimate_noise(candidates: Sequence[Candidate], sensor: BeamModel) -> float:

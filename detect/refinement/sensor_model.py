@@ -1,8 +1,21 @@
 """The likelihood of a beam: range noise, outliers, the sensor's footprint, and the background behind a shape.
 
-A beam that meets a surface at range r measures z with Gaussian noise around r, censored at range_min and range_max,
-or is an outlier, uniform over all ranges (the beam model of Thrun, Burgard and Fox 2005, section 6.3, without the
-exponential term). A beam that misses the shape meets the background: what stands behind it, as the map has it.
+A beam whose surface is at range r has the likelihood, in units of the Gaussian's peak 1 / (sigma sqrt(2 pi)):
+
+- measured range z:  exp(-(z - r)² / 2 sigma²) + e
+- too near (-inf):   Phi((range_min - r) / sigma) + e
+- no return:         Phi((r - range_max) / sigma) + e
+
+with e the outliers' uniform density in the same units: the beam model of Thrun, Burgard and Fox (2005, section 6.3)
+without its exponential term, and with censored measurements (Tobit) in the place of its peak at range_max.
+
+A beam whose line passes a shape hits it (r from the shape), or misses it and meets the background: another candidate
+or a wall that occludes it (r from that), else the map. There the range is known to half a cell only, the map is wrong
+for a share of the rays, and a beam that leaves the map returns from anywhere beyond, or not at all. At silhouettes
+both likelihoods are mixed by the share of the beam's footprint that hits.
+
+The forward mapper has a model of its own (mapping.forward.likelihood): there surfaces are unknown, and one share of
+outliers for the whole log is estimated.
 """
 
 from __future__ import annotations
@@ -91,9 +104,14 @@ class BeamModel:
         return RayData(bundle.rays, bundle.outcomes, self.std, self.table)
 
 
+def _inverse_peak(std: float) -> float:
+    """Return one over the Gaussian's peak (m): a density of 1 / m in units of it."""
+    return std * math.sqrt(2 * math.pi)
+
+
 def _uniform_density(std: float, span: float) -> float:
     """Return the uniform density over all ranges in units of the Gaussian's peak."""
-    return std * math.sqrt(2 * math.pi) / span
+    return _inverse_peak(std) / span
 
 
 @dataclass(frozen=True)
@@ -102,30 +120,30 @@ class Background:
 
     Attributes:
         ranges: (N,) where they end (m).
-        ends: (N,) whether that is an occupied cell; the others leave the map there.
+        hits_map: (N,) whether that is an occupied cell; the others leave the map there.
         blocked: (N,) whether they end before they come near the primitive.
         uncertainty: Standard deviation of the ranges (m).
     """
 
     ranges: FloatArray
-    ends: NDArray[np.bool_]
+    hits_map: NDArray[np.bool_]
     blocked: NDArray[np.bool_]
     uncertainty: float
 
     def select(self, chosen: NDArray[np.bool_]) -> Background:
         """Return the background of the chosen rays (N,)."""
-        return Background(self.ranges[chosen], self.ends[chosen], self.blocked[chosen], self.uncertainty)
+        return Background(self.ranges[chosen], self.hits_map[chosen], self.blocked[chosen], self.uncertainty)
 
 
 @dataclass(frozen=True)
-class ClearanceMap:
+class DistanceMap:
     """The chessboard distance (cells) of each cell (rows, cols) of a map to the nearest occupied one."""
 
-    clear: NDArray[np.uint8]
+    distances: NDArray[np.uint8]
     frame: GridFrame
 
     @classmethod
-    def of(cls, occupied: NDArray[np.bool_], frame: GridFrame) -> ClearanceMap:
+    def of(cls, occupied: NDArray[np.bool_], frame: GridFrame) -> DistanceMap:
         """Compute the distances.
 
         Args:
@@ -135,17 +153,17 @@ class ClearanceMap:
         Returns:
             The map of distances.
         """
-        clear = np.empty(occupied.shape, np.uint8)
-        chessboard_distances(occupied, clear)
-        return cls(clear, frame)
+        distances = np.empty(occupied.shape, np.uint8)
+        chessboard_distances(occupied, distances)
+        return cls(distances, frame)
 
     def background(self, bundle: RayBundle) -> Background:
         """Cast rays through the map; a cell says where its surface is to within a cell."""
-        ranges, ends = np.zeros(len(bundle)), np.zeros(len(bundle), np.bool_)
+        ranges, hits_map = np.zeros(len(bundle)), np.zeros(len(bundle), np.bool_)
         frame = self.frame
         grid = frame.row, frame.col, 1 / frame.resolution
-        cast_through_map(self.clear, grid, bundle.rays, bundle.max_range, ranges, ends)
-        return Background(ranges, ends, ends & (ranges < bundle.nearest), 0.5 * frame.resolution)
+        cast_through_map(self.distances, grid, bundle.rays, bundle.max_range, ranges, hits_map)
+        return Background(ranges, hits_map, hits_map & (ranges < bundle.entry_range), 0.5 * frame.resolution)
 
 
 def background_log_likelihood(bundle: RayBundle, background: Background, sensor: BeamModel) -> FloatArray:
@@ -159,7 +177,7 @@ def background_log_likelihood(bundle: RayBundle, background: Background, sensor:
     Returns:
         (N,) in nats.
     """
-    likelihood = surface_likelihood(bundle, background.ranges, background.ends, background.uncertainty, sensor)
+    likelihood = surface_likelihood(bundle, background.ranges, background.hits_map, background.uncertainty, sensor)
     return np.asarray(np.log(likelihood))
 
 
@@ -170,7 +188,7 @@ def with_background(
     occluders: Sequence[Primitive],
     sensor: BeamModel,
 ) -> RayBundle:
-    """Set what rays measure where they miss a primitive: the rows OCCLUSION and BACKGROUND.
+    """Return rays with what they measure where they miss a primitive.
 
     Args:
         bundle: N rays.
@@ -180,7 +198,7 @@ def with_background(
         sensor: The sensor.
 
     Returns:
-        The rays with both rows set.
+        The rays, the rows OCCLUSION and BACKGROUND set.
     """
     rays = bundle.rays.copy()
     rays[OCCLUSION] = FAR
@@ -208,16 +226,16 @@ def table_nearest(table: FloatArray, outcomes: NDArray[np.int8], x: FloatArray) 
 
 
 def surface_likelihood(
-    bundle: RayBundle, ranges: FloatArray, ends: NDArray[np.bool_], uncertainty: float, sensor: BeamModel
+    bundle: RayBundle, ranges: FloatArray, hits_map: NDArray[np.bool_], uncertainty: float, sensor: BeamModel
 ) -> FloatArray:
     """Compute the likelihood of measurements where rays end at given ranges, or leave the map there.
 
-    A ray that leaves the map ends anywhere beyond, or nowhere.
+    A ray that leaves the map hits_map anywhere beyond, or nowhere.
 
     Args:
         bundle: N rays.
         ranges: (N,) where they end or leave (m).
-        ends: (N,) whether they end.
+        hits_map: (N,) whether they end.
         uncertainty: Standard deviation of these ranges (m).
         sensor: The sensor.
 
@@ -235,10 +253,10 @@ def surface_likelihood(
         outcomes == MEASURED,
         (1 - options.no_return_beyond)
         * beyond
-        * _uniform_density(sensor.std, 1.0)
+        * _inverse_peak(sensor.std)
         / np.maximum(bundle.max_range - ranges, sensor.std),
         np.where(outcomes == NO_RETURN, options.no_return_beyond, options.outlier_share),
     )
     unexplained = np.where(outcomes == MEASURED, uniform, options.censored_doubt)
     doubt = options.background_doubt
-    return np.asarray((1 - doubt) * np.where(ends, at_surface, left) + doubt * unexplained)
+    return np.asarray((1 - doubt) * np.where(hits_map, at_surface, left) + doubt * unexplained)

@@ -17,8 +17,8 @@ ORIGIN_X, ORIGIN_Y, DIRECTION_X, DIRECTION_Y = range(4)
 """Rows of rays (7, N), as in detect.refinement.kernels."""
 
 FAR = 1e30
-MAX_CLEARANCE = 255
-"""Clearances are stored in one byte."""
+MAX_DISTANCE = 255
+"""Distances are stored in one byte."""
 
 
 @kernel
@@ -29,7 +29,7 @@ def chessboard_distances(occupied: Any, out: Any) -> None:
 
     Args:
         occupied: (rows, cols) bool.
-        out: (rows, cols) uint8 gets the distances, at most MAX_CLEARANCE.
+        out: (rows, cols) uint8 gets the distances, at most MAX_DISTANCE.
     """
     rows, cols = occupied.shape
     for r in range(rows):
@@ -37,7 +37,7 @@ def chessboard_distances(occupied: Any, out: Any) -> None:
             near = 0
             if r > 0 and 0 < c < cols - 1:
                 near = min(out[r - 1, c - 1], out[r - 1, c], out[r - 1, c + 1], out[r, c - 1])
-            out[r, c] = 0 if occupied[r, c] else min(near + 1, MAX_CLEARANCE)
+            out[r, c] = 0 if occupied[r, c] else min(near + 1, MAX_DISTANCE)
     for r in range(rows - 1, -1, -1):
         for c in range(cols - 1, -1, -1):
             near = 0
@@ -47,21 +47,22 @@ def chessboard_distances(occupied: Any, out: Any) -> None:
 
 
 @kernel
-def cast_through_map(clear: Any, grid: Any, rays: Any, max_ranges: Any, ranges: Any, ends: Any) -> None:
+def cast_through_map(distances: Any, grid: Any, rays: Any, max_ranges: Any, ranges: Any, ends: Any) -> None:
     """Find where rays end in a map: in the first occupied cell, or where they leave it.
 
-    Over free space as many cells are taken at once as the clearance allows.
+    Over free space as many cells are taken at once as the distance to the nearest occupied one allows.
 
     Args:
-        clear: (rows, cols) of :func:`chessboard_distances`.
+        distances: (rows, cols) of :func:`chessboard_distances`.
         grid: row and column of the plane's cell at which the map begins, and 1 / resolution (1 / m).
         rays: (7, N).
         max_ranges: (N,) of the sensors (m).
-        ranges: (N,) gets the ranges (m).
+        ranges: (N,) gets the ranges (m): to the middle of a ray's way through the occupied cell, or to where it
+            leaves the map, and at most the sensor's.
         ends: (N,) gets whether the ray ends in an occupied cell.
     """
     row, col, inverse_resolution = grid
-    rows, cols = clear.shape
+    rows, cols = distances.shape
     for i in range(len(ranges)):
         x, y = rays[ORIGIN_X, i] * inverse_resolution - col, rays[ORIGIN_Y, i] * inverse_resolution - row
         dx, dy = rays[DIRECTION_X, i], rays[DIRECTION_Y, i]
@@ -77,7 +78,7 @@ def cast_through_map(clear: Any, grid: Any, rays: Any, max_ranges: Any, ranges: 
             next_c = (c + first_c - x) * per_c if dx != 0.0 else FAR
             next_r = (r + first_r - y) * per_r if dy != 0.0 else FAR
             if 0 <= c < cols and 0 <= r < rows:
-                free = clear[r, c]
+                free = distances[r, c]
                 if free == 0:
                     at, ends[i] = 0.5 * (at + min(next_c, next_r)), True
                     break

@@ -15,7 +15,7 @@ from detect.detection import Detection, Detections, Rejection
 from detect.refinement.candidates import Candidate, find_backgrounds, fit_candidates
 from detect.refinement.evidence import exact_costs
 from detect.refinement.fit import KindFit, other_apexes, refit, starts
-from detect.refinement.geometry import TIES, parameters_of, primitive_of
+from detect.refinement.geometry import JACOBIANS, parameters_of, primitive_of
 from detect.refinement.lines import find_lines
 from detect.refinement.map_cells import MapCells, OneSidedWall, is_within
 from detect.refinement.options import DEFAULTS
@@ -31,7 +31,7 @@ from detect.refinement.refine import (
 )
 from detect.refinement.sensor_model import (
     BeamModel,
-    ClearanceMap,
+    DistanceMap,
     background_log_likelihood,
     with_background,
 )
@@ -141,7 +141,7 @@ def test_the_kind_does_not_depend_on_the_guess(
 def test_a_fit_of_a_special_case_starts_the_general_kind(kind: Kind, simple: Kind, theta: float) -> None:
     true = replace(shape(kind, theta=theta), size=(0.2, 0.17))
     beams, sensor = beams_of(true)
-    guess = KindFit(simple, np.array([0.003, 0.0, theta, 0.19, 0.19]), 0.0, np.eye(TIES[simple].shape[1]))
+    guess = KindFit(simple, np.array([0.003, 0.0, theta, 0.19, 0.19]), 0.0, np.eye(JACOBIANS[simple].shape[1]))
     fits = {fit.kind: fit for fit in refit([guess], beams, sensor)}
     assert set(fits) == {kind, simple} and fits[kind].cost < fits[simple].cost - 10
     assert polygon_iou(primitive_of(kind, fits[kind].p), true) > 0.97
@@ -338,7 +338,7 @@ def test_background_is_that_of_the_map_and_of_occluders() -> None:
     cells = MapCells.of(mapped(taken))
     sensor = BeamModel.create(0.01, span)
     occupied = cells.without(world.primitives, 0.02)
-    background = ClearanceMap.of(occupied, cells.frame).background(around)
+    background = DistanceMap.of(occupied, cells.frame).background(around)
     by_map = background_log_likelihood(around, background, sensor)
     beams = with_background(around, background, by_map, [world.primitives[1]], sensor)
     exact = world.cast((0.0, 0.0), np.array([[1.0, 0.0]]))
@@ -403,9 +403,9 @@ def test_walls_are_large_and_primitives_are_not(
 def test_reasons_name_the_limit() -> None:
     made = RefinedPrimitive(FIVE[0], {"side": 0.001}, np.eye(4), dict.fromkeys(Kind, 0.2), 3.0, 0.0, 100, 1.0)
     assert "by 3 nats only" in rejection_reason(made)
-    assert "in the map alone" in rejection_reason(replace(made, gain=100.0, misfit=2.0))
-    assert "not known to within 25%" in rejection_reason(replace(made, gain=100.0, std={"side": 0.06}))
-    assert rejection_reason(replace(made, gain=100.0)) == "" and "too large" in rejection_reason(None)
+    assert "in the map alone" in rejection_reason(replace(made, log_ratio=100.0, misfit=2.0))
+    assert "not known to within 25%" in rejection_reason(replace(made, log_ratio=100.0, std={"side": 0.06}))
+    assert rejection_reason(replace(made, log_ratio=100.0)) == "" and "too large" in rejection_reason(None)
 
 
 def test_pieces_of_a_scan_count_as_one_scan() -> None:
