@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import islice
@@ -19,8 +18,7 @@ from detect.networks.weights import Weights, load_weight_set
 from detect.networks.yolo import KINDS, Boxes, Yolo, box_iou, non_maximum_suppression
 from mapping.grid import GridFrame, OccupancyGrid
 from prim.errors import UsageError
-from prim.metrics import polygon_areas
-from prim.shapes import Primitive
+from prim.metrics import shared_area
 
 
 @dataclass(frozen=True)
@@ -237,7 +235,7 @@ def _reject_overlapping(
     kept: list[Detection] = []
     rejected = []
     for detection in detections:
-        cover = [_cover(detection.primitive, other.primitive) for other in kept]
+        cover = [shared_area(detection.primitive, other.primitive) for other in kept]
         if max(cover, default=0.0) <= max_cover:
             kept.append(detection)
             continue
@@ -247,14 +245,6 @@ def _reject_overlapping(
         kind = detection.primitive.kind
         rejected.append(Rejection(kind, detection.score, (x0 + x1) / 2, (y0 + y1) / 2, reason))
     return tuple(kept), rejected
-
-
-def _cover(a: Primitive, b: Primitive) -> float:
-    """Return the area that two outlines share, as a share of the smaller one's."""
-    if math.hypot(a.x - b.x, a.y - b.y) > sum(max(primitive.width_height) for primitive in (a, b)):
-        return 0.0
-    first, second, shared = polygon_areas(a, b)
-    return shared / min(first, second)
 
 
 def _boxed_kind(part: _TileCandidates, boxes: Boxes, i: int) -> BoxedKind:

@@ -93,6 +93,22 @@ def polygon_iou(a: Primitive, b: Primitive) -> float:
     return shared / (first + second - shared)
 
 
+def shared_area(a: Primitive, b: Primitive) -> float:
+    """Compute the area that two outlines' polygons share, as a share of the smaller one's.
+
+    Args:
+        a: One primitive.
+        b: The other.
+
+    Returns:
+        From 0 to 1.
+    """
+    if math.hypot(a.x - b.x, a.y - b.y) > a.circumradius + b.circumradius:
+        return 0.0
+    first, second, shared = polygon_areas(a, b)
+    return shared / min(first, second)
+
+
 def polygon_areas(a: Primitive, b: Primitive) -> tuple[float, float, float]:
     """Compute the areas of two outlines' polygons and of their intersection.
 

@@ -26,7 +26,6 @@ from detect.refinement.sensor_model import (
 )
 from detect.refinement.walls import Wall, walls_behind
 from prim.arrays import FloatArray
-from prim.metrics import polygon_areas
 from prim.shapes import Primitive
 
 
@@ -216,19 +215,3 @@ def centroid_distance(a: Primitive, b: Primitive) -> float:
         Metres.
     """
     return math.hypot(a.x - b.x, a.y - b.y)
-
-
-def shared_area(a: Primitive, b: Primitive) -> float:
-    """Return the area that two primitives share, as a fraction of the smaller one's.
-
-    Args:
-        a: One.
-        b: The other.
-
-    Returns:
-        0 to 1.
-    """
-    if centroid_distance(a, b) > a.circumradius + b.circumradius:
-        return 0.0
-    first, second, shared = polygon_areas(a, b)
-    return shared / min(first, second)

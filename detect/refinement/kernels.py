@@ -17,7 +17,6 @@ compiled in.
 from __future__ import annotations
 
 import math
-from functools import lru_cache
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -25,6 +24,7 @@ from numpy.typing import NDArray
 
 from prim.arrays import FloatArray
 from prim.compiled import compiled
+from prim.normal import normal_table
 
 FAST = {"arcp", "contract", "reassoc", "nsz"}
 """Fast-math flags: reciprocals, fused operations and other orders of sums; infinities and NaN keep their meaning."""
@@ -160,16 +160,9 @@ class Schedule(NamedTuple):
     information_blur: float
 
 
-@lru_cache(maxsize=1)
-def _normal() -> tuple[NDArray[np.float64], ...]:
-    """Return the tables' x, exp(-x²/2), and Phi(-x)."""
-    x = np.arange(-TABLE_REACH * TABLE_SPACING, TABLE_REACH * TABLE_SPACING + 1) / TABLE_SPACING
-    return x, np.exp(-(x**2) / 2), np.array([0.5 * math.erfc(value / math.sqrt(2)) for value in x])
-
-
 def upper_tail(cut: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the probability (N,) that a standard normal variable exceeds each ``cut`` (N,)."""
-    x, _, upper = _normal()
+    x, _, upper = normal_table(TABLE_REACH, TABLE_SPACING)
     return np.interp(cut, x, upper)
 
 
@@ -185,7 +178,7 @@ def likelihood_table(outlier: float) -> FloatArray:
     Returns:
         (6, 2 * TABLE_REACH * TABLE_SPACING + 1).
     """
-    x, density, upper = _normal()
+    x, density, upper = normal_table(TABLE_REACH, TABLE_SPACING)
     phi = density / math.sqrt(2 * math.pi)
     measured, near, far = density + outlier, upper + outlier, upper[::-1] + outlier
     slopes = [-x * density / measured, -phi / near, phi / far]

@@ -20,7 +20,7 @@ from detect.refinement.kernels import (
     append_passing,
 )
 from detect.refinement.options import DEFAULTS, RefinementOptions
-from mapping.forward.mapper import neighbour_noise
+from mapping.range_noise import neighbour_noise
 from prim.arrays import FloatArray
 from prim.scan import RangeOutcome, Scan
 from prim.se2 import Pose2D

@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from detect.detection import Detection, Detections, Rejection
-from detect.refinement.candidates import Candidate, find_backgrounds, fit_candidates, shared_area
+from detect.refinement.candidates import Candidate, find_backgrounds, fit_candidates
 from detect.refinement.evidence import compare_kinds
 from detect.refinement.geometry import parameters_of, ranges_to
 from detect.refinement.kernels import BACKGROUND, OCCLUSION
@@ -35,6 +35,7 @@ from detect.refinement.sensor_estimation import estimate_noise, estimate_sensor,
 from detect.refinement.sensor_model import Background, BeamModel, DistanceMap, surface_likelihood
 from mapping.grid import OccupancyGrid
 from prim.arrays import FloatArray
+from prim.metrics import shared_area
 from prim.scan import Scan
 from prim.se2 import Pose2D
 from prim.shapes import Kind, Primitive
