@@ -68,9 +68,9 @@ def features(job: Job) -> tuple[Job, NDArray[np.float64], NDArray[np.bool_], NDA
         mapper.accumulate(scan, pose)
     fit = mapper.fit()
     free = session.truth.crossed if noise_std < resolution else session.truth.free
-    used = (session.truth.occupied | free) & is_known(fit.certainty, fit.evidence)
+    used = (session.truth.occupied | free) & is_known(fit.arrival_probability, fit.visits)
     own, neighbourhood = (
-        log_odds(array[used]) for array in surface_probability(fit.stopping, fit.certainty, fit.evidence)
+        log_odds(array[used]) for array in surface_probability(fit.stopping, fit.arrival_probability, fit.visits)
     )
     stopping = np.log(fit.stopping[used].astype(np.float64))
     log_noise = math.log(fit.noise.std / resolution)

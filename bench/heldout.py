@@ -27,7 +27,7 @@ from mapping.mapper import make_mapper
 from prim.log import open_log
 from prim.scan import Scan
 from prim.se2 import Pose2D
-from replay.mapping_stage import frame_of_end_points
+from replay.mapping_stage import grid_frame_of_scans
 
 EVERY = 5
 CLIPS = (1e-5, 1e-4, 1e-3, 1e-2)
@@ -48,7 +48,7 @@ def rays_of(scans: Posed) -> RayStore:
 
 def frame_of(scans: Posed, resolution: float) -> GridFrame:
     """Compute the frame of the end points of all beams; the side of a cell is ``resolution`` (m)."""
-    frame = frame_of_end_points(scans, resolution)
+    frame = grid_frame_of_scans(scans, resolution)
     assert frame is not None
     return frame
 

@@ -23,7 +23,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from detect.refinement.geometry import TIES, parameters_of, ranges_to, shape_ranges
+from detect.refinement.geometry import JACOBIANS, parameters_of, ranges_to, shape_ranges
 from detect.refinement.rays import RayBundle, collect_rays
 from prim.arrays import FloatArray
 from prim.raycast import cast_segments
@@ -131,8 +131,8 @@ class Scene:
 
     @property
     def tie(self) -> FloatArray:
-        """The matrix (5, K) from the kind's own parameters to all five: see detect.refinement.geometry.TIES."""
-        return TIES[self.primitive.kind]
+        """The matrix (5, K) from the kind's own parameters to all five: see detect.refinement.geometry.JACOBIANS."""
+        return JACOBIANS[self.primitive.kind]
 
     def ranges(self, at: FloatArray) -> FloatArray:
         """Return the exact ranges (N,) in m for the parameters ``at`` (5,) of the primitive."""

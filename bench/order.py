@@ -29,12 +29,12 @@ def compare(scans: Posed, frame: GridFrame) -> str:
     known = (ahead.occupied | ahead.free, back.occupied | back.free)
     both = np.count_nonzero(known[0] & known[1])
     flipped = (ahead.occupied & back.free) | (ahead.free & back.occupied)
-    assert ahead.evidence is not None
+    assert ahead.visits is not None
     return (
         f"{both:,} cells known both ways; of these {np.count_nonzero(flipped) / both:.2%} change sides, their median "
-        f"evidence {np.median(ahead.evidence[flipped]):.1f} rays; "
+        f"visits {np.median(ahead.visits[flipped]):.1f}; "
         f"{np.count_nonzero(known[0] ^ known[1]) / np.count_nonzero(known[0] | known[1]):.1%} of all known cells are "
-        f"known one way only, their median evidence {np.median(ahead.evidence[known[0] ^ known[1]]):.1f}"
+        f"known one way only, their median visits {np.median(ahead.visits[known[0] ^ known[1]]):.1f}"
     )
 
 

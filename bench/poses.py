@@ -40,7 +40,7 @@ from replay.poses.fusion import Fusion
 from replay.poses.fusion_nodes import FusionNodes
 from replay.poses.fusion_options import SENSORS, FusionInputs, SensorNoise
 from replay.poses.laser_poses import FUSED, LaserPoses
-from replay.poses.localize import Localizer
+from replay.poses.pose_provider import PoseProvider
 from replay.poses.scan_matching import match_scans
 from replay.result import ReplayResult
 from replay.selection import Selection
@@ -76,12 +76,12 @@ def fusion_errors(seed: int) -> Errors:
     errors: Errors = {}
     with tempfile.TemporaryDirectory() as folder, open_log(driven(folder, seed, rays=16)) as log:
         times = ScanLog(log, None, Selection()).times
-        truth = Localizer(log).locate(times, "truth").poses
-        odometry = Localizer(log).locate(times, "odom").poses
+        truth = PoseProvider(log).laser_poses(times, "truth").poses
+        odometry = PoseProvider(log).laser_poses(times, "odom").poses
         errors["odometry"] = (*pose_rmse(odometry, truth), math.nan)
         for name, sensors in SUBSETS.items():
             try:
-                fused = Localizer(log, inputs=FusionInputs(sensors)).locate(times, FUSED)
+                fused = PoseProvider(log, inputs=FusionInputs(sensors)).laser_poses(times, FUSED)
             except LogReadError:
                 continue
             assert fused.covariances is not None and fused.fusion is not None
@@ -151,8 +151,8 @@ def speed_table() -> str:
         record_session(path, SessionOptions(seed=0, motion="drive", duration=600.0, lidar=Lidar(rays=2)))
         with open_log(path) as log:
             scans = ScanLog(log, None, Selection())
-            whole = best_of(3, lambda: Localizer(log).locate(scans.times, FUSED))
-            fusion = Localizer(log).locate(scans.times, FUSED).fusion
+            whole = best_of(3, lambda: PoseProvider(log).laser_poses(scans.times, FUSED))
+            fusion = PoseProvider(log).laser_poses(scans.times, FUSED).fusion
         assert fusion is not None
         nodes = fusion.nodes
         estimation = best_of(3, lambda: Fusion(nodes))
@@ -192,7 +192,9 @@ def run_filterpy(nodes: FusionNodes) -> FloatArray:
     filtered.x, filtered.P = np.append(nodes.fixes[0], nodes.headings[0]), np.eye(3)
     position, turn = np.eye(2, 3), np.array([[0.0, 0.0, 1.0]])
     fix_noise, turn_noise = np.eye(2) * 0.01, np.array([[0.05**2]])
-    for step, distance, fix, heading in zip(nodes.steps, nodes.distances, nodes.fixes, nodes.headings, strict=True):
+    for step, distance, fix, heading in zip(
+        nodes.steps, nodes.variance_scales, nodes.fixes, nodes.headings, strict=True
+    ):
         cos, sin = math.cos(filtered.x[2]), math.sin(filtered.x[2])
         dx, dy = cos * step[0] - sin * step[1], sin * step[0] + cos * step[1]
         filtered.F = np.array([[1, 0, -dy], [0, 1, dx], [0, 0, 1.0]])
@@ -213,10 +215,10 @@ def matching_errors(seed: int) -> Errors:
         path = driven(folder, seed)
         with open_log(path) as log:
             scans = ScanLog(log, None, Selection())
-            truth = Localizer(log).locate(scans.times, "truth").poses
+            truth = PoseProvider(log).laser_poses(scans.times, "truth").poses
             posed_scans = partial(PosedScans, scans)
             for source in ("odom", FUSED):
-                poses = Localizer(log).locate(scans.times, source)
+                poses = PoseProvider(log).laser_poses(scans.times, source)
                 start = time.perf_counter()
                 matched = match_scans(poses, scans.stamps, posed_scans, 0.01)
                 spent = time.perf_counter() - start
@@ -251,7 +253,7 @@ def csail_table(path: Path) -> str:
     lines = ["| poses of csail.mcap | held-out, nats per ray | matched | time |", "|---|---:|---:|---:|"]
     with open_log(path) as log:
         scans = ScanLog(log, None, Selection())
-        given = Localizer(log).locate(scans.times)
+        given = PoseProvider(log).laser_poses(scans.times)
         posed_scans = partial(PosedScans, scans, options=PosedScanOptions(CSAIL_RESOLUTION / 2))
         rng = np.random.default_rng(1)
         for name, (metres, degrees) in CSAIL_NOISE.items():

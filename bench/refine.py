@@ -38,7 +38,8 @@ from detect.training.matches import ScoredBoxes
 from mapping.mapper import make_mapper
 from prim.arrays import FloatArray
 from prim.metrics import match_primitives
-from prim.shapes import Kind, Primitive, angle_difference, angle_error
+from prim.se2 import angle_difference
+from prim.shapes import Kind, Primitive, angle_error
 from recorder.sensors import Lidar
 from recorder.session import SessionOptions
 

@@ -15,9 +15,9 @@ from prim.se2 import Pose2D
 from prim.shapes import Primitive
 from recorder.session import SessionOptions, record_session
 from replay.ground_truth import GroundTruth
-from replay.mapping_stage import frame_of_world
+from replay.mapping_stage import grid_frame_of_world
 from replay.posed_scans import PosedScans, ScanLog
-from replay.poses.localize import Localizer
+from replay.poses.pose_provider import PoseProvider
 from replay.selection import Selection
 
 
@@ -55,7 +55,7 @@ def recorded(options: SessionOptions, resolution: float = 0.01) -> Session:
             truth = GroundTruth.read(log)
             assert truth is not None
             scans = scans_with_poses(log, "truth")
-    frame = frame_of_world(truth.world, resolution)
+    frame = grid_frame_of_world(truth.world, resolution)
     cells = ReferenceMap(frame)
     for scan, pose in scans:
         cells.update(scan, pose, truth.at(scan.stamp))
@@ -73,5 +73,5 @@ def scans_with_poses(log: LogSource, source: str = "auto") -> list[tuple[Scan, P
         The scans, each as a whole, with the laser's pose at its first beam.
     """
     scan_log = ScanLog(log, None, Selection())
-    poses = Localizer(log, None, None).locate(scan_log.times, source)
+    poses = PoseProvider(log, None, None).laser_poses(scan_log.times, source)
     return [(posed.scan, posed.pose) for posed in PosedScans(scan_log, poses)]

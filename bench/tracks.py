@@ -21,7 +21,7 @@ from bench.maps import update
 from prim.metrics import match_primitives
 from recorder.sensors import Lidar
 from recorder.session import SessionOptions, record_session
-from replay.detection import DetectionResult
+from replay.detection_stage import DetectionResult
 from replay.options import ReplayOptions
 from replay.pipeline import Pipeline
 from replay.viewing.protocol import NullViewer

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from prim.shapes import Kind, Primitive
+from prim.world import Bounds
 
 
 @dataclass(frozen=True)
@@ -18,16 +19,16 @@ class Detection:
     Attributes:
         primitive: Kind and parameters, map frame.
         score: Confidence, 0 to 1: the class score of YOLO; after refinement the posterior probability of the kind.
-        box: Bounding box x0, y0, x1, y1 (m): YOLO's; after refinement that of the outline.
-        crop: Grey image (pixels, pixels) that the parameters were estimated from; (0, 0) where the networks had not
-            detected the primitive.
+        box: Bounding box (m), map frame: YOLO's; after refinement that of the outline.
+        crop: Crop of the map's image (pixels, pixels) that the parameters were estimated from; (0, 0) where the
+            networks had not detected the primitive.
         std: Standard deviations (m, rad) of the parameters by name; None where nothing was refined.
         kind_probabilities: Posterior probabilities of the kinds; None where nothing was refined.
     """
 
     primitive: Primitive
     score: float
-    box: tuple[float, float, float, float]
+    box: Bounds
     crop: NDArray[np.uint8]
     std: Mapping[str, float] | None = None
     kind_probabilities: Mapping[Kind, float] | None = None

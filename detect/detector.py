@@ -12,18 +12,24 @@ import numpy as np
 from numpy.typing import NDArray
 
 from detect.detection import Detection, Detections, Rejection
-from detect.networks.cnn import BoxedKind, ParameterEstimator
-from detect.networks.tiles import TILE_SIZE, crop_to_tile, tile_frames, tile_image
+from detect.networks.cnn import ClassifiedRegion, ParameterEstimator
+from detect.networks.tiles import TILE_SIZE, clip_to_tile, tile_frames, tile_image
 from detect.networks.weights import Weights, load_weight_set
 from detect.networks.yolo import KINDS, Boxes, Yolo, box_iou, non_maximum_suppression
 from mapping.grid import GridFrame, OccupancyGrid
 from prim.errors import UsageError
-from prim.metrics import shared_area
+from prim.metrics import overlap_coefficient
+from prim.world import Bounds
 
 
 @dataclass(frozen=True)
 class DetectorOptions:
-    """Parameters of the detector; score thresholds come from the model card of the weights."""
+    """Parameters of the detector.
+
+    A candidate's score decides first. Below ``score_floor`` it is dropped, below ``doubtful_threshold`` rejected,
+    below its kind's threshold (the model card's, else ``default_threshold``) doubtful: refinement decides. From there
+    on it is detected, unless it overlaps a better one.
+    """
 
     score_floor: float = 0.05
     """Smallest score of a candidate; set by hand."""
@@ -31,7 +37,7 @@ class DetectorOptions:
     default_threshold: float = 0.25
     """Smallest score of a detection of a kind whose model card names none: YOLOv5's default."""
 
-    doubtful_score: float = 0.08
+    doubtful_threshold: float = 0.08
     """Smallest score of candidates below their kind's threshold that are passed on to refinement; set by hand."""
 
     max_doubtful: int = 24
@@ -40,8 +46,8 @@ class DetectorOptions:
     nms_iou: float = 0.45
     """Largest intersection over union of two detections' boxes: YOLOv5's default."""
 
-    max_cover: float = 0.25
-    """Largest overlap of two detections' outlines, as a share of the smaller one's area; set by hand."""
+    max_overlap: float = 0.25
+    """Largest intersection of two detections' outlines over the smaller one's area (no IoU); set by hand."""
 
     border: int = 2
     """Boxes this near (cells) to a tile's border, where the map goes on, are left to the next tile; set by hand."""
@@ -59,8 +65,8 @@ class _TileCandidates:
 
     Attributes:
         tile: The tile's frame.
-        grey: Its grey image (TILE_SIZE, TILE_SIZE).
-        boxes: The candidates, in cells of the plane (those of the frames' rows and columns).
+        grey: First channel (TILE_SIZE, TILE_SIZE) of its image.
+        boxes: The candidates, in cells of the plane (those of the frames' columns and rows).
     """
 
     tile: GridFrame
@@ -123,6 +129,7 @@ class Detector:
 
         Raises:
             UsageError: The map has another resolution than those that the networks were trained on.
+            WeightsError: A network does not take its images, or gives outputs that are not finite.
         """
         if not np.isclose(grid.frame.resolution, self.card.resolution, rtol=1e-6):
             expected, actual = self.card.resolution, grid.frame.resolution
@@ -139,6 +146,9 @@ class Detector:
 
         Returns:
             Detections, rejected and doubtful candidates.
+
+        Raises:
+            WeightsError: A network does not take its images, or gives outputs that are not finite.
         """
         parts = list(self._candidates(images))
         boxes = Boxes.concatenate([part.boxes for part in parts])
@@ -150,7 +160,7 @@ class Detector:
         suppressor = self._suppress(boxes, whole & (boxes.score >= thresholds), [len(part.boxes) for part in parts])
         kept = np.flatnonzero(suppressor == np.arange(len(boxes)))
         measured = _best_first(self._estimate(kept, boxes, part_of, frame))
-        found, overlapping = _reject_overlapping(measured, self.options.max_cover)
+        found, overlapping = _reject_overlapping(measured, self.options.max_overlap)
         rejections = {
             i: _rejection(boxes, i, frame, self._reason(boxes, i, better, bool(whole[i])))
             for i, better in enumerate(suppressor.tolist())
@@ -173,13 +183,13 @@ class Detector:
 
     def _is_whole(self, box: NDArray[np.float32], tile: GridFrame, frame: GridFrame) -> bool:
         """Return whether a box (cells of the plane) is clear of its tile's borders where the map goes on."""
-        left, top, right, bottom = box.tolist()
+        x0, y0, x1, y1 = box.tolist()
         border = self.options.border
         truncated = (
-            frame.col < tile.col and left < tile.col + border,
-            frame.row < tile.row and top < tile.row + border,
-            frame.col + frame.cols > tile.col + TILE_SIZE and right > tile.col + TILE_SIZE - border,
-            frame.row + frame.rows > tile.row + TILE_SIZE and bottom > tile.row + TILE_SIZE - border,
+            frame.col < tile.col and x0 < tile.col + border,
+            frame.row < tile.row and y0 < tile.row + border,
+            frame.col + frame.cols > tile.col + TILE_SIZE and x1 > tile.col + TILE_SIZE - border,
+            frame.row + frame.rows > tile.row + TILE_SIZE and y1 > tile.row + TILE_SIZE - border,
         )
         return not any(truncated)
 
@@ -201,16 +211,16 @@ class Detector:
         self, chosen: NDArray[np.intp], boxes: Boxes, part_of: Sequence[_TileCandidates], frame: GridFrame
     ) -> list[Detection]:
         """Return some candidates with parameters estimated from their crops."""
-        boxed = [_boxed_kind(part_of[i], boxes, i) for i in chosen.tolist()]
+        regions = [_region(part_of[i], boxes, i) for i in chosen.tolist()]
         return [
-            Detection(primitive, float(boxes.score[i]), _box_in_metres(boxes, i, frame), self.estimator.crop(item))
-            for i, item, primitive in zip(chosen.tolist(), boxed, self.estimator(boxed), strict=True)
+            Detection(primitive, float(boxes.score[i]), _box_in_metres(boxes, i, frame), self.estimator.crop(region))
+            for i, region, primitive in zip(chosen.tolist(), regions, self.estimator(regions), strict=True)
         ]
 
     def _doubtful(self, boxes: Boxes, eligible: NDArray[np.bool_], kept: NDArray[np.intp]) -> NDArray[np.intp]:
         """Return the best candidates with too small a score that no kept one overlaps, in descending order."""
         options = self.options
-        eligible = eligible & (boxes.score >= options.doubtful_score)
+        eligible = eligible & (boxes.score >= options.doubtful_threshold)
         for i in kept.tolist():
             eligible &= box_iou(boxes.box[i], boxes.box) <= options.nms_iou
         suppressor = non_maximum_suppression(boxes, options.nms_iou, eligible=eligible)
@@ -229,30 +239,30 @@ class Detector:
 
 
 def _reject_overlapping(
-    detections: Sequence[Detection], max_cover: float
+    detections: Sequence[Detection], max_overlap: float
 ) -> tuple[tuple[Detection, ...], list[Rejection]]:
     """Split detections, best first, into those whose outlines are clear of better ones and the rejected rest."""
     kept: list[Detection] = []
     rejected = []
     for detection in detections:
-        cover = [shared_area(detection.primitive, other.primitive) for other in kept]
-        if max(cover, default=0.0) <= max_cover:
+        overlaps = [overlap_coefficient(detection.primitive, other.primitive) for other in kept]
+        if max(overlaps, default=0.0) <= max_overlap:
             kept.append(detection)
             continue
-        better = kept[int(np.argmax(cover))].primitive.kind
-        reason = f"its outline covers that of a better {better} by more than {max_cover:g} of the smaller one"
+        better = kept[int(np.argmax(overlaps))].primitive.kind
+        reason = f"its outline covers that of a better {better} by more than {max_overlap:g} of the smaller one"
         x0, y0, x1, y1 = detection.box
         kind = detection.primitive.kind
         rejected.append(Rejection(kind, detection.score, (x0 + x1) / 2, (y0 + y1) / 2, reason))
     return tuple(kept), rejected
 
 
-def _boxed_kind(part: _TileCandidates, boxes: Boxes, i: int) -> BoxedKind:
+def _region(part: _TileCandidates, boxes: Boxes, i: int) -> ClassifiedRegion:
     """Return a candidate as the estimator takes it."""
     tile = part.tile
-    left, top, right, bottom = boxes.box[i].tolist()
-    box = (left - tile.col, top - tile.row, right - tile.col, bottom - tile.row)
-    return BoxedKind(part.grey, tile, box, KINDS[boxes.kind[i]])
+    x0, y0, x1, y1 = boxes.box[i].tolist()
+    box = (x0 - tile.col, y0 - tile.row, x1 - tile.col, y1 - tile.row)
+    return ClassifiedRegion(part.grey, tile, box, KINDS[boxes.kind[i]])
 
 
 def _best_first(items: Iterable[Scored]) -> tuple[Scored, ...]:
@@ -262,7 +272,7 @@ def _best_first(items: Iterable[Scored]) -> tuple[Scored, ...]:
 def _occupied_tiles(grid: OccupancyGrid) -> Iterator[GridFrame]:
     """Yield the tiles that hold occupied cells."""
     for tile in tile_frames(grid.frame):
-        part = crop_to_tile(grid, tile)
+        part = clip_to_tile(grid, tile)
         if part is not None and part.occupied.any():
             yield tile
 
@@ -272,11 +282,11 @@ def _batches(items: Iterator[Item], size: int) -> Iterator[list[Item]]:
         yield batch
 
 
-def _box_in_metres(boxes: Boxes, i: int, frame: GridFrame) -> tuple[float, float, float, float]:
-    left, bottom, right, top = (float(value) * frame.resolution for value in boxes.box[i])
-    return left, bottom, right, top
+def _box_in_metres(boxes: Boxes, i: int, frame: GridFrame) -> Bounds:
+    x0, y0, x1, y1 = (float(value) * frame.resolution for value in boxes.box[i])
+    return x0, y0, x1, y1
 
 
 def _rejection(boxes: Boxes, i: int, frame: GridFrame, reason: str) -> Rejection:
-    left, bottom, right, top = _box_in_metres(boxes, i, frame)
-    return Rejection(KINDS[boxes.kind[i]], float(boxes.score[i]), (left + right) / 2, (bottom + top) / 2, reason)
+    x0, y0, x1, y1 = _box_in_metres(boxes, i, frame)
+    return Rejection(KINDS[boxes.kind[i]], float(boxes.score[i]), (x0 + x1) / 2, (y0 + y1) / 2, reason)

@@ -23,7 +23,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from prim.arrays import FloatArray
-from prim.shapes import Kind, Primitive, angle_difference
+from prim.se2 import angle_difference
+from prim.shapes import Kind, Primitive
 
 if TYPE_CHECKING:
     from detect.detection import Detection
@@ -62,8 +63,9 @@ class TrackerOptions:
     """Standard deviation of the process noise of one update, as a share of that of the detection: detections on one
     growing map have correlated errors, and primitives move."""
 
-    min_score: float = 0.05
-    """The measurement variance is divided by the score, or by this where the score is less."""
+    min_weight: float = 0.05
+    """The measurement variance of a detection that corrects a filter is divided by its score, or by this where the
+    score is less; that of the detection that starts a filter is not."""
 
     min_size: float = 1e-3
     """Smallest size (m) of a track's primitive."""
@@ -107,7 +109,7 @@ class _Hypothesis:
             measurement[2] = self.state[2] + innovation
         noise = _measurement_variance(detection, self.options)
         predicted = self.variance + noise * self.options.process_noise**2
-        gain = predicted / (predicted + noise / max(detection.score, self.options.min_score))
+        gain = predicted / (predicted + noise / max(detection.score, self.options.min_weight))
         self.state = self.state + gain * (measurement - self.state)
         self.variance = (1 - gain) * predicted
         self.score += detection.score

@@ -17,8 +17,8 @@ UNKNOWN = np.float32(0.5)
 UNKNOWN_GREY = 128
 """Grey value of a probability of 0.5 in an image."""
 
-WHITE_EVIDENCE = 10_000.0
-"""In an image, this evidence (expected rays to a cell) and more is white: part of the networks' image definition."""
+WHITE_VISITS = 10_000.0
+"""In an image, this many expected visits of a cell and more are white: part of the networks' image definition."""
 
 MAX_CELLS = 200_000_000
 """A grid of more cells is refused: it would not fit into a laptop's memory. Set by hand."""
@@ -131,13 +131,13 @@ class OccupancyGrid:
     Attributes:
         frame: Where it lies.
         probability: Probability of occupancy (rows, cols) float32, 0.5 where unknown.
-        evidence: Expected number of rays that reached each cell (rows, cols) float32; None where the mapper does not
-            compute it.
+        visits: Expected number of rays that reached each cell (rows, cols) float32: those that ended in it and those
+            that passed it; None where the mapper does not compute it.
     """
 
     frame: GridFrame
     probability: NDArray[np.float32]
-    evidence: NDArray[np.float32] | None = None
+    visits: NDArray[np.float32] | None = None
 
     @property
     def occupied(self) -> BoolGrid:
@@ -150,18 +150,19 @@ class OccupancyGrid:
         return self.probability < UNKNOWN
 
     def image(self) -> NDArray[np.uint8]:
-        """Return the detector's image (rows, cols, 3) uint8: probability of occupancy, evidence, known or not.
+        """Return the detector's image (rows, cols, 3) uint8: probability of occupancy, expected visits, known or not.
 
-        The probability is scaled to 0 to 255. The evidence is logarithmic, 255 at WHITE_EVIDENCE rays and more; where
-        there is none it equals the third channel: 255 where the cell is known, else 0. Row 0 is at the smallest y.
+        The probability is scaled to 0 to 255. The visits are logarithmic, 255 at WHITE_VISITS rays and more; where
+        the mapper has none, the channel equals the third one: 255 where the cell is known, else 0. Row 0 is at the
+        smallest y.
         """
         known = np.where(self.occupied | self.free, np.uint8(255), np.uint8(0))
-        evidence = known
-        if self.evidence is not None:
-            scaled = np.log1p(self.evidence) * (255 / math.log1p(WHITE_EVIDENCE))
-            evidence = np.clip(scaled, 0, 255).astype(np.uint8)
+        visits = known
+        if self.visits is not None:
+            scaled = np.log1p(self.visits) * (255 / math.log1p(WHITE_VISITS))
+            visits = np.clip(scaled, 0, 255).astype(np.uint8)
         probability = np.rint(self.probability * 255).astype(np.uint8)
-        return np.stack((probability, evidence, known), axis=-1)
+        return np.stack((probability, visits, known), axis=-1)
 
 
 class GrowingGrid:

@@ -9,7 +9,7 @@ from enum import StrEnum
 
 
 class MapperName(StrEnum):
-    """The mappers."""
+    """The mappers: deterministic (``det``; no detection), probabilistic (``prob``), with a forward sensor model."""
 
     DET = "det"
     PROB = "prob"

@@ -9,7 +9,7 @@ class PrimError(Exception):
     """Base of all expected errors; the message is one line: what is wrong, where, and what to do.
 
     Attributes:
-        exit_code: What a command exits with: 2 for usage, 1 for an input that cannot be used.
+        exit_code: What a command exits with: 2 for usage, 130 for an interruption (128 + SIGINT), else 1.
     """
 
     exit_code = 1

@@ -29,9 +29,11 @@ class Pair:
         truth: Index of the true primitive.
         same_kind: Whether the kinds agree.
         position: Distance of the centroids (m).
-        angle: Error of theta modulo the symmetry (rad); None where the kinds differ or have no angle.
-        width: Absolute error of the width in the paper's sense (m).
-        height: Absolute error of the height in the paper's sense (m).
+        angle: Error of theta modulo the symmetry (rad); None where the kinds differ or where
+            :func:`prim.shapes.angle_error` has none: for circles, and true ellipses that are nearly circles.
+        width: Absolute error of the width (m): the full extent of shapes with corners, but half the extent of round
+            ones (:attr:`prim.shapes.Primitive.width_height`).
+        height: The same of the height (m).
         iou: Intersection over union of the outlines' polygons.
     """
 
@@ -54,7 +56,8 @@ class Pair:
 class DetectionErrors:
     """Detection rates, and mean absolute errors over the true positives.
 
-    A mean is None where there is no true positive (for the angle: none with an angle).
+    A mean is None where there is no true positive (for the angle: none with an error in angle). Those of width and
+    height mix full extents of shapes with corners and half extents of round ones.
 
     Attributes:
         precision: True positives over all detections; without detections 1 if there is no true primitive, else 0.
@@ -93,8 +96,8 @@ def polygon_iou(a: Primitive, b: Primitive) -> float:
     return shared / (first + second - shared)
 
 
-def shared_area(a: Primitive, b: Primitive) -> float:
-    """Compute the area that two outlines' polygons share, as a share of the smaller one's.
+def overlap_coefficient(a: Primitive, b: Primitive) -> float:
+    """Compute the overlap coefficient of two outlines' polygons: their intersection over the smaller one's area.
 
     Args:
         a: One primitive.
@@ -103,7 +106,7 @@ def shared_area(a: Primitive, b: Primitive) -> float:
     Returns:
         From 0 to 1.
     """
-    if math.hypot(a.x - b.x, a.y - b.y) > a.circumradius + b.circumradius:
+    if math.hypot(a.x - b.x, a.y - b.y) > a.bounding_radius + b.bounding_radius:
         return 0.0
     first, second, shared = polygon_areas(a, b)
     return shared / min(first, second)

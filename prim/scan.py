@@ -17,7 +17,7 @@ from prim.se2 import Pose2D, wrap_angle
 
 
 class RangeOutcome(IntEnum):
-    """What became of one beam, by REP 117 (Fixed Distance Range Sensor Conventions) and sensor_msgs/LaserScan.
+    """The outcome of one beam, nearly as REP 117 and sensor_msgs/LaserScan define it; the differences stand below.
 
     ============  =======================================  ====================================================
     outcome       range z                                  meaning
@@ -25,8 +25,12 @@ class RangeOutcome(IntEnum):
     MEASURED      range_min <= z < range_max, and z > 0    the distance to a surface
     TOO_NEAR      -inf                                     a surface nearer than range_min
     NO_RETURN     z >= range_max, +inf among them          no surface up to range_max
-    INVALID       NaN; finite, but below range_min or <= 0  no measurement; REP 117 calls such numbers erroneous
+    INVALID       NaN; finite, but below range_min or <= 0  no measurement
     ============  =======================================  ====================================================
+
+    REP 117 («Informational Distance Measurements») counts z = range_max as valid, discards finite values outside the
+    limits, and calls only NaN erroneous. Here z = range_max and finite values above it are NO_RETURN, and finite
+    values below range_min are INVALID as NaN is, which discards them.
 
     TOO_NEAR and NO_RETURN are censored measurements: mappers with an inverse sensor model skip the former, forward
     models take both by the probability of the tail.
@@ -143,7 +147,7 @@ class PosedScan:
     """A scan with the laser's pose.
 
     Attributes:
-        position: The scan's index among those of the log.
+        position: The scan's index in the selection that is replayed, from 0; not its index in the log.
         scan: The whole scan.
         pose: The laser's pose in the map frame at the first beam.
         pieces: The scan in parts, each with the laser's pose while it was taken (see :func:`deskew`).

@@ -112,10 +112,10 @@ class Trajectory:
         return cls(rising[last], raw_poses[order][last])
 
     def at(self, stamps: Stamps) -> tuple[FloatArray, NDArray[np.bool_]]:
-        """Interpolate poses linearly, headings along the shorter arc.
+        """Interpolate the poses at many stamps at once: linearly, headings along the shorter arc.
 
         Args:
-            stamps: (M,) ns.
+            stamps: (M,) ns, in any order.
 
         Returns:
             Poses (M, 3), and which stamps (M,) lie within the trajectory's time; outside of it the pose is that of
@@ -134,13 +134,27 @@ class Trajectory:
 
 
 def wrap_angle(angle: float) -> float:
-    """Return the angle (rad) in [-pi, pi)."""
+    """Return one angle (rad) in [-pi, pi)."""
     return (angle + math.pi) % (2 * math.pi) - math.pi
 
 
 def wrap_angles(angles: FloatArray) -> FloatArray:
-    """Return angles (rad) in [-pi, pi)."""
+    """Return an array of angles (rad), of any shape, in [-pi, pi): :func:`wrap_angle` of many."""
     return (angles + np.pi) % (2 * np.pi) - np.pi
+
+
+def angle_difference(a: float, b: float, period: float = 2 * math.pi) -> float:
+    """Subtract angles modulo a period: with the default one, ``wrap_angle(a - b)``.
+
+    Args:
+        a: An angle (rad).
+        b: What is subtracted (rad).
+        period: The period (rad).
+
+    Returns:
+        a - b in [-period/2, period/2).
+    """
+    return (a - b + period / 2) % period - period / 2
 
 
 def rotate(points: ArrayLike, theta: float) -> FloatArray:

@@ -12,7 +12,7 @@ triangle    base, height (isosceles)       [0, 2 pi), direction of the base, ape
 ellipse     semi_major >= semi_minor       [0, pi), direction of the major axis
 ==========  =============================  ==========================================
 
-Nothing here is a half size but the radius and the semi-axes: side, width, height and base are full lengths.
+Side, width, height and base are full lengths; the radius and the semi-axes are half lengths.
 
 All that a kind is stands in its row of :class:`Kind`; nothing elsewhere asks for a kind by its name. A shape is its
 kind's unit outline stretched by width and height, turned by theta and moved to its centroid.
@@ -32,6 +32,7 @@ import numpy as np
 
 from prim.arrays import FloatArray
 from prim.raycast import cast_ellipses, cast_segments
+from prim.se2 import angle_difference
 
 SIDES_AGREE = 0.03
 """Sides that differ by no more than this share make a shape look more symmetric than its kind is."""
@@ -94,7 +95,7 @@ TRIANGLE: Polygon = ((-1 / 2, -1 / 3), (1 / 2, -1 / 3), (0.0, 2 / 3))
 
 @dataclass(frozen=True)
 class Row:
-    """What a kind is.
+    """A row of the table of kinds: all that a kind is.
 
     Attributes:
         sizes: The sizes' names, in the order of :attr:`Primitive.size`. A single one is tied: it is both the width
@@ -176,12 +177,12 @@ class Kind(StrEnum):
 
     @cached_property
     def vertices(self) -> FloatArray:
-        """The unit outline's vertices (N, 2), counter-clockwise; of the disc (OUTLINE_POINTS, 2) on it."""
+        """The unit outline's vertices (N, 2), counter-clockwise; for the disc OUTLINE_POINTS points on its rim."""
         return _round_vertices(OUTLINE_POINTS) if self.is_round else np.array(self.row.outline)
 
     @cached_property
     def reciprocals(self) -> FloatArray:
-        """One over the unit outline's vertices (N, 2): a third of a height is rounded once, as height / 3 is."""
+        """One over the unit outline's vertices (N, 2): sizes are divided by it, so that height / 3 rounds once."""
         with np.errstate(divide="ignore"):
             return np.asarray(1 / self.vertices)
 
@@ -197,7 +198,7 @@ class Kind(StrEnum):
 
     @cached_property
     def spread_factors(self) -> tuple[float, float]:
-        """How many times the variance of the area along x and y the squares of width and height are."""
+        """width^2 / var_x and height^2 / var_y, with the variances of points spread evenly over the area."""
         if self.is_round:
             return 4.0, 4.0
         area, along_x, along_y = _moments(self.vertices)
@@ -263,8 +264,9 @@ class Primitive:
     def width_height(self) -> tuple[float, float]:
         """Width and height in the sense of the paper's Table II (m): what the unit outline is stretched by.
 
-        Base and height of a triangle, semi-major and semi-minor axis of an ellipse, the radius on both for a
-        circle, the side on both for a square.
+        Full extents of shapes with corners (the side twice, width and height, base and height), but half extents of
+        round ones (the radius twice, semi-major and semi-minor axis). A mean error of the width or the height over
+        several kinds therefore mixes errors of full and of half lengths.
         """
         return self.size[0], self.size[-1]
 
@@ -275,8 +277,8 @@ class Primitive:
         return self.kind.unit_area * width * height
 
     @property
-    def circumradius(self) -> float:
-        """The largest distance of the outline from the centroid (m)."""
+    def bounding_radius(self) -> float:
+        """Radius about the centroid that bounds the outline (m); not that of the circumscribed circle."""
         if self.is_round:
             return max(self.width_height)
         return float(np.hypot(*self.local_outline().T).max())
@@ -290,7 +292,7 @@ class Primitive:
         return tuple(np.hypot(*(np.roll(corners, -1, axis=0) - corners).T).tolist())
 
     def sides_agree(self, share: float) -> bool:
-        """Return whether all sides are the same to within ``share`` of the longest one."""
+        """Return whether the longest and the shortest side differ by at most ``share`` of the longest one."""
         return max(self.sides) - min(self.sides) <= share * max(self.sides)
 
     @property
@@ -360,7 +362,11 @@ class Primitive:
 
     @classmethod
     def from_json(cls, value: Mapping[str, Any]) -> Primitive:
-        """Invert :meth:`to_json`. Raises ValueError that names what is wrong."""
+        """Invert :meth:`to_json`.
+
+        Raises:
+            ValueError: The value does not describe a primitive; the message names what is wrong.
+        """
         if not isinstance(value, Mapping):
             raise ValueError(f"{json.dumps(value)} does not describe a primitive")
         try:
@@ -378,20 +384,6 @@ class Primitive:
             raise ValueError(f"{json.dumps(value)} does not describe a primitive") from None
 
 
-def angle_difference(a: float, b: float, period: float = 2 * math.pi) -> float:
-    """Subtract angles modulo a period.
-
-    Args:
-        a: An angle (rad).
-        b: What is subtracted (rad).
-        period: The period (rad).
-
-    Returns:
-        a - b in [-period/2, period/2).
-    """
-    return (a - b + period / 2) % period - period / 2
-
-
 def angle_error(estimate: Primitive, truth: Primitive) -> float | None:
     """Compute the error in angle modulo the true shape's own symmetry.
 
@@ -400,7 +392,8 @@ def angle_error(estimate: Primitive, truth: Primitive) -> float | None:
         truth: The true primitive.
 
     Returns:
-        Radians, 0 or more; None where either has no angle.
+        The error (rad), 0 or more; None where either has no angle, or where the true shape counts as a circle: an
+        ellipse whose axes agree within SIDES_AGREE.
     """
     if truth.symmetry is None or estimate.theta is None or truth.theta is None:
         return None

@@ -21,7 +21,7 @@ Wall = tuple[float, float, float, float]
 """A thin wall from (x0, y0) to (x1, y1), metres, map frame."""
 
 Bounds = tuple[float, float, float, float]
-"""x0, y0, x1, y1 in metres."""
+"""An axis-aligned rectangle of the map frame: x0, y0, x1, y1 (m), the least x and y first."""
 
 
 @dataclass(frozen=True)
@@ -82,7 +82,11 @@ class World:
 
     @classmethod
     def from_json(cls, value: Mapping[str, Any]) -> World:
-        """Invert :meth:`to_json`. Raises ValueError that names what is wrong."""
+        """Invert :meth:`to_json`.
+
+        Raises:
+            ValueError: The value does not describe a world; the message names what is wrong.
+        """
         if not isinstance(value, Mapping) or "size" not in value:
             raise ValueError("a world is an object with 'size', 'primitives' and 'walls'")
         size = _numbers(value["size"], 2, "size")
@@ -94,7 +98,11 @@ class World:
 
     @classmethod
     def load(cls, path: Path) -> World:
-        """Read a world from a JSON file. Raises WorldError."""
+        """Read a world from a JSON file.
+
+        Raises:
+            WorldError: The file cannot be read or does not describe a world.
+        """
         try:
             return cls.from_json(json.loads(path.read_text(encoding="utf-8")))
         except (UnicodeDecodeError, json.JSONDecodeError) as error:

@@ -42,7 +42,7 @@ MM_PER_M = 1000
 
 
 class MotionName(StrEnum):
-    """How the robot moves."""
+    """How the robot moves: put from place to place (``warp``, the paper's word for teleporting), or driving."""
 
     WARP = "warp"
     DRIVE = "drive"

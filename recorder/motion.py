@@ -1,4 +1,4 @@
-"""How the robot moves: warped from place to place by a supervisor, or driving by its wheels."""
+"""How the robot moves: warped (teleported) from place to place by a supervisor, or driving by its wheels."""
 
 from __future__ import annotations
 
@@ -25,7 +25,8 @@ class Step:
     Attributes:
         pose: The robot's true pose.
         world: The world as it is then.
-        travelled: How far a wheel has rolled since the step before (m).
+        travelled: The true path since the step before plus |turn| x track width / 2 (m): how far the outer wheel
+            rolls if it does not slip. The odometry's noise grows with it.
     """
 
     pose: Pose2D
@@ -68,7 +69,7 @@ DEFAULTS = ExplorerOptions()
 
 
 def warp(simulator: Simulator, rng: np.random.Generator, stops: tuple[int, int] = (10, 10)) -> Iterator[Step]:
-    """Put the robot on a regular grid of places, at random headings (the paper's supervisor).
+    """Teleport the robot over a regular grid of places, at random headings (the paper's supervisor «warps» it).
 
     Args:
         simulator: The world and the robot.
@@ -127,7 +128,7 @@ def drive(
             simulator.drive(*explorer.wheel_speeds(simulator.pose, speed), period / substeps)
             pose = simulator.pose
             turned = abs(wrap_angle(pose.theta - before.theta))
-            travelled += math.hypot(pose.x - before.x, pose.y - before.y) + turned * simulator.options.axle / 2
+            travelled += math.hypot(pose.x - before.x, pose.y - before.y) + turned * simulator.options.track_width / 2
 
 
 class Explorer:
@@ -193,7 +194,7 @@ class Explorer:
         self._watch_progress(math.hypot(x - pose.x, y - pose.y))
         error = wrap_angle(math.atan2(y - pose.y, x - pose.x) - pose.theta)
         rate = min(max(options.heading_gain * error, -options.max_turn_rate), options.max_turn_rate)
-        turn = rate * self._simulator.options.axle / 2
+        turn = rate * self._simulator.options.track_width / 2
         ahead = speed * max(0.0, math.cos(error)) ** 2
         largest = max(abs(ahead - turn), abs(ahead + turn), speed)
         return (ahead - turn) * speed / largest, (ahead + turn) * speed / largest

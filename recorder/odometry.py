@@ -12,7 +12,7 @@ from prim.se2 import Pose2D
 
 @dataclass(frozen=True)
 class OdometryNoise:
-    """White noise of wheel odometry, whose variances grow in proportion to the distance travelled.
+    """White noise of wheel odometry, whose variances grow in proportion to the distance travelled (path and turns).
 
     Attributes:
         translation_std: Standard deviation of the position, along and across alike, after one metre (m).
@@ -42,7 +42,7 @@ class Odometry:
 
         Args:
             true_pose: The robot's true pose after it.
-            travelled: How far a wheel rolled during it (m).
+            travelled: Path and turn during it (m), as :attr:`recorder.motion.Step.travelled`.
 
         Returns:
             The pose by odometry, with the covariance of its error.

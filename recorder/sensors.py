@@ -54,7 +54,9 @@ class Lidar:
         return np.where(distances > self.range_max, np.inf, distances)
 
     def measure(self, world: World, pose: Pose2D, stamp: int, period: float, rng: np.random.Generator) -> Scan:
-        """Take a scan; what noise moves out of the limits reads -inf or +inf (REP 117).
+        """Take a scan; below ``range_min`` it reads -inf, above ``range_max`` +inf (REP 117).
+
+        The limits are applied after the noise: to surfaces that lie beyond them, and to those that noise moves there.
 
         Args:
             world: What is around.

@@ -74,7 +74,7 @@ class SessionOptions:
         seed: Seeds every random choice; each cause of chance has a generator of its own.
         world: What is drawn, unless the world is read from a file.
         world_file: A JSON file of the world, as World.to_json makes it.
-        motion: «warp», over ``stops``; or «drive», with odometry that drifts.
+        motion: «warp», teleported over ``stops``; or «drive», with odometry that drifts.
         stops: Columns and rows of the places that the robot is warped to.
         duration: How long it drives (s).
         speed: Largest rim speed of a wheel (m/s).
@@ -157,6 +157,7 @@ def record_session(path: Path, options: SessionOptions) -> Session:
         UsageError: The primitives do not fit on the floor, or the robot has no place to stand.
         WorldError: The world's file is no world.
         OutputError: The log cannot be written.
+        InterruptedRecordingError: The recording was interrupted; the message names the file of the recorded part.
     """
     generators = _Generators.from_seed(options.seed)
     if options.world_file:
@@ -230,11 +231,16 @@ _UNLESS_DEFAULT = ("simulator", "explorer", "placement")
 """Options that are described only where they are not the defaults."""
 
 
+_SIMULATOR_KEYS = {"track_width": "axle"}
+"""Metadata keys of the simulator's options where they are not the fields' names."""
+
+
 def _describe(options: SessionOptions) -> dict[str, str]:
     """Return the recording options as the log's metadata: SI units, JSON values."""
     described = asdict(options)
     noise = options.odometry
     described["odometry"] = {"metres": noise.translation_std, "radians": noise.rotation_std}
+    described["simulator"] = {_SIMULATOR_KEYS.get(name, name): v for name, v in described["simulator"].items()}
     for name in _ONLY_FOR["warp" if options.motion == "drive" else "drive"]:
         del described[name]
     for name in _UNLESS_DEFAULT:

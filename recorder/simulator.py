@@ -23,7 +23,7 @@ class SimulatorOptions:
 
     Attributes:
         robot_radius: Radius of the robot's body (m); the e-puck's, by its data sheet.
-        axle: Distance between the wheels (m); the e-puck's, by its data sheet.
+        track_width: Distance between the wheels (m); the e-puck's, by its data sheet.
         robot_mass: Kg; about the e-puck's.
         primitive_density: Mass of movable primitives (kg/m^2); hollow boxes that the robot can push, set by hand.
         gravity: m/s^2; standard gravity.
@@ -41,7 +41,7 @@ class SimulatorOptions:
     """
 
     robot_radius: float = 0.035
-    axle: float = 0.053
+    track_width: float = 0.053
     robot_mass: float = 0.16
     primitive_density: float = 4.0
     gravity: float = 9.81
@@ -86,7 +86,7 @@ class Simulator:
         self._disc.friction = options.contact_friction
 
     def warp(self, pose: Pose2D) -> bool:
-        """Put the robot at ``pose``, at rest; return False where it would touch something or stand inside it."""
+        """Teleport the robot to ``pose``, at rest; return False where it would touch something or stand inside it."""
         if self._disc in self._space.shapes:
             self._space.remove(self._robot, self._disc)
         self._robot.position, self._robot.angle = (pose.x, pose.y), pose.theta
@@ -124,10 +124,10 @@ class Simulator:
         """
         if self._disc not in self._space.shapes:
             self._space.add(self._robot, self._disc)
-        step, axle = self.options.step, self.options.axle
+        step, offset = self.options.step, self.options.track_width / 2
         for _ in range(round(seconds / step)):
-            self._pull(left, axle / 2)
-            self._pull(right, -axle / 2)
+            self._pull(left, offset)
+            self._pull(right, -offset)
             self._space.step(step)
 
     def current_world(self) -> World:
@@ -162,7 +162,7 @@ class Simulator:
 
     def _shape(self, primitive: Primitive, body: pymunk.Body) -> pymunk.Shape:
         if not primitive.kind.has_angle:
-            return pymunk.Circle(body, primitive.circumradius)
+            return pymunk.Circle(body, primitive.bounding_radius)
         return pymunk.Poly(body, primitive.local_outline(self.options.outline_points).tolist())
 
     def _add_floor_friction(self, body: pymunk.Body, primitive: Primitive) -> None:

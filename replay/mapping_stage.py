@@ -1,4 +1,4 @@
-"""The map of a replay: its frame, its mapper, and the stage that adds scan after scan."""
+"""The map of a replay: the place and size of its grid, its mapper, and the stage that adds scan after scan."""
 
 from __future__ import annotations
 
@@ -53,7 +53,8 @@ class MappingStage:
 
     Args:
         mapper: The mapper.
-        snapshot_interval: A snapshot of the map is wanted every so many scans; None for no snapshots.
+        snapshot_interval: N for a snapshot of the map after the scans at positions 0, N, 2N and so on; None for no
+            snapshots.
         streaming: Whether the map is needed before the last scan, by the viewer or by the detector.
         timer: Counts the time towards the stage «map».
 
@@ -80,7 +81,7 @@ class MappingStage:
         return elapsed
 
     def snapshot(self, position: int) -> OccupancyGrid | None:
-        """Return the map so far where a snapshot is due after the scan at ``position``; else None."""
+        """Return the map so far where a snapshot is due after the scan at ``position`` (in the selection)."""
         if not self._snapshot_interval or position % self._snapshot_interval:
             return None
         with self._timer.stage("map"):
@@ -100,8 +101,8 @@ class MappingStage:
         return []
 
 
-def choose_frame(posed_scans: PosedScans, options: ReplayOptions, world: World | None) -> GridFrame:
-    """Choose the map's frame: the bounds that are given, else the recorded world's, else those of all end points.
+def choose_grid_frame(posed_scans: PosedScans, options: ReplayOptions, world: World | None) -> GridFrame:
+    """Choose the place and size of the map's grid by the given bounds, else the recorded world, else the end points.
 
     Args:
         posed_scans: The scans to be mapped.
@@ -109,7 +110,7 @@ def choose_frame(posed_scans: PosedScans, options: ReplayOptions, world: World |
         world: The recorded world; None where it is not known.
 
     Returns:
-        The smallest frame of whole cells that covers the bounds.
+        The smallest grid of whole cells that covers the bounds.
 
     Raises:
         LogReadError: The bounds follow from the end points, and no usable scan has a pose.
@@ -117,38 +118,38 @@ def choose_frame(posed_scans: PosedScans, options: ReplayOptions, world: World |
     if options.bounds is not None:
         return GridFrame.covering(options.bounds, options.resolution)
     if world is not None:
-        return frame_of_world(world, options.resolution)
-    frame = frame_of_end_points((piece for posed in posed_scans for piece in posed.pieces), options.resolution)
+        return grid_frame_of_world(world, options.resolution)
+    frame = grid_frame_of_scans((piece for posed in posed_scans for piece in posed.pieces), options.resolution)
     if frame is None:
         path = posed_scans.scan_log.path
         raise LogReadError(path, "no scan that can be used has a pose", "give another --pose")
     return frame
 
 
-def frame_of_world(world: World, resolution: float) -> GridFrame:
-    """Compute the frame that a recorded world is mapped in.
+def grid_frame_of_world(world: World, resolution: float) -> GridFrame:
+    """Compute the place and size of the grid that a recorded world is mapped on.
 
     Args:
         world: The world.
         resolution: Side of a cell (m).
 
     Returns:
-        The smallest frame of whole cells that covers the world and a margin of WORLD_MARGIN.
+        The smallest grid of whole cells that covers the world and a margin of WORLD_MARGIN.
     """
     x0, y0, x1, y1 = world.bounds
     m = WORLD_MARGIN
     return GridFrame.covering((x0 - m, y0 - m, x1 + m, y1 + m), resolution)
 
 
-def frame_of_end_points(scans: Iterable[tuple[Scan, Pose2D]], resolution: float) -> GridFrame | None:
-    """Compute the frame of the end points of all beams.
+def grid_frame_of_scans(scans: Iterable[tuple[Scan, Pose2D]], resolution: float) -> GridFrame | None:
+    """Compute the place and size of the grid that holds the end points of all measured beams, and the sensor.
 
     Args:
         scans: Scans, or pieces of them, with the laser's poses.
         resolution: Side of a cell (m).
 
     Returns:
-        The smallest frame that holds them; None without scans.
+        The smallest such grid; None without scans.
     """
     extents = [hit_extent(scan_arrays(scan, pose), 1 / resolution) for scan, pose in scans]
     if not extents:
@@ -165,7 +166,7 @@ def make_replay_mapper(
 
     Args:
         posed_scans: The scans to be mapped.
-        frame: The map's frame.
+        frame: The place and size of the map's grid.
         options: Mapper, sensor model, resolution and range noise.
         timer: Counts the time of estimating the noise towards the stage «map».
 

@@ -31,7 +31,7 @@ class ReplayOptions:
         resolution: Side of a cell (m).
         bounds: Bounds of the map (m): x0, y0, x1, y1; None to choose them.
         scan_topic: The topic of scans; None where the log has only one.
-        odom_topic: The topic of poses; None where the log has only one.
+        odom_topic: The topic of poses; None: found by type. Where one is given, the source ``auto`` means ``odom``.
         laser_offset: The laser's pose on the robot (m, rad); None where tf has it.
         max_range: Ranges beyond this count as no return (m); None for the scanner's own range_max.
         standing_still: The robot does not move: map without poses.
@@ -40,9 +40,11 @@ class ReplayOptions:
         match_scans: Whether poses are corrected by matching scans.
         selection: Which scans are replayed.
         rate: The replay is held to this multiple of the log's speed; None for no limit.
-        map_every: The map is shown every so many scans; None to choose the interval.
+        map_every: N to show the map after the scans at positions 0, N, 2N and so on of the selection; None to choose
+            the interval.
         detect: Whether primitives are detected.
-        detect_every: Primitives are detected every so many scans as well as at the end; None for the end only.
+        detect_every: N to detect primitives after the scans at positions N - 1, 2N - 1 and so on of the selection,
+            and at the end; None for the end only.
         refine: Whether detections are refined with the rays.
         weights: The weights of the detector; None for those that come with prim.
         recover: Whether what is left of a damaged log is read.

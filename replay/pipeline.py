@@ -16,16 +16,16 @@ from prim.errors import LogReadError, WorldError
 from prim.log import open_log
 from prim.log.source import LogSource
 from prim.scan import PosedScan
-from replay.detection import DetectionResult, DetectionStage, NoDetection, make_detection_stage
-from replay.evaluation import ReplayEvaluator
+from replay.detection_stage import DetectionResult, DetectionStage, NoDetection, make_detection_stage
 from replay.ground_truth import GroundTruth
-from replay.mapping_stage import MappingStage, choose_frame, make_replay_mapper
+from replay.mapping_stage import MappingStage, choose_grid_frame, make_replay_mapper
 from replay.notes import pluralize
 from replay.options import ReplayOptions
 from replay.posed_scans import PosedScanOptions, PosedScans, ScanLog
 from replay.poses.fusion_options import FusionInputs, SensorNoise
 from replay.poses.laser_poses import FUSED, LaserPoses
-from replay.poses.localize import Localizer
+from replay.poses.pose_provider import PoseProvider
+from replay.replay_evaluator import ReplayEvaluator
 from replay.result import ReplayResult
 from replay.timing import RatePacer, StageTimer
 from replay.viewing.protocol import NullViewer, Scene, Viewer
@@ -80,17 +80,22 @@ class Pipeline:
     def run(self) -> ReplayResult:
         """Replay the log, from the file to the result.
 
+        Returns:
+            The map, its poses and detections, and their evaluation where the log has ground truth.
+
         Raises:
             LogReadError: The log cannot be read, or lacks what the replay needs.
             UsageError: The options do not fit together or do not fit the log.
-            OutputError: The recording cannot be written.
+            WeightsError: The detector's weights cannot be used, be they named or those that come with prim.
+            OutputError: The viewer's recording cannot be created.
+            RecordingError: The viewer's recording could not be written in full, at the end.
         """
         with self._abandoned_on_failure(), open_log(self.path, recover=self.options.recover) as log:
             scans = self._read_scans(log)
             truth = self._read_truth(log)
-            poses, true_poses = self._localize(log, scans)
+            poses, true_poses = self._estimate_poses(log, scans)
             posed_scans = self._posed_scans(scans, poses)
-            frame = choose_frame(posed_scans, self.options, truth.world if truth else None)
+            frame = choose_grid_frame(posed_scans, self.options, truth.world if truth else None)
             evaluator = ReplayEvaluator(frame, truth, poses, true_poses)
             detection = self._make_detection_stage(frame, evaluator, poses)
             mapping = self._make_mapping_stage(frame, posed_scans, detection)
@@ -121,37 +126,37 @@ class Pipeline:
                 self._notes.append(f"the map is not scored: {error}")
                 return None
 
-    def _localize(self, log: LogSource, scans: ScanLog) -> tuple[LaserPoses, LaserPoses | None]:
-        """Estimate the laser's pose at every scan; return the true ones beside it where the log has them."""
+    def _estimate_poses(self, log: LogSource, scans: ScanLog) -> tuple[LaserPoses, LaserPoses | None]:
+        """Return the poses of the laser that the replay uses, matched where that is asked for, and the true ones."""
         with self._timer.stage("localize"):
-            poses, true_poses = self._locate(log, scans)
+            poses, true_poses = self._look_up_poses(log, scans)
             if self.options.match_scans:
                 poses = self._match_scans(scans, poses)
         return poses, true_poses
 
-    def _locate(self, log: LogSource, scans: ScanLog) -> tuple[LaserPoses, LaserPoses | None]:
-        """Read the laser's poses from the source that is asked for, and the true ones."""
+    def _look_up_poses(self, log: LogSource, scans: ScanLog) -> tuple[LaserPoses, LaserPoses | None]:
+        """Return the laser's poses by the source that is asked for, and the true ones where the log has them."""
         options = self.options
-        localizer = Localizer(log, options.odom_topic, options.laser_offset, options.fuse)
+        provider = PoseProvider(log, options.odom_topic, options.laser_offset, options.fuse)
         times = scans.times if options.deskew else replace(scans.times, sweep=0)
         if options.standing_still:
-            return localizer.stand_still(times), None
-        poses = localizer.locate(times, options.pose)
+            return provider.stationary_poses(times), None
+        poses = provider.laser_poses(times, options.pose)
         fuse = replace(options.fuse, noise=SensorNoise()) if options.match_scans else options.fuse
         if fuse != FusionInputs() and poses.source != FUSED:
             self._notes.append(f"nothing is fused, since there are poses on {poses.origin}: give --pose fused")
         if poses.source == "truth":
             return poses, poses
-        if not localizer.has_truth:
+        if not provider.has_truth:
             return poses, None
         try:
-            return poses, localizer.locate(times, "truth")
+            return poses, provider.laser_poses(times, "truth")
         except LogReadError as error:
             self._notes.append(f"the poses are not held against the truth: {error.what}")
             return poses, None
 
     def _match_scans(self, scans: ScanLog, poses: LaserPoses) -> LaserPoses:
-        """Correct the poses by matching every scan with the map of the others."""
+        """Correct the poses by matching every scan with a map of the scans."""
         from replay.poses.scan_matching import match_scans  # when it is needed: a replay without it starts faster
 
         options = self.options
@@ -218,7 +223,7 @@ class Pipeline:
             bounds=frame.bounds,
             has_scores=evaluator.scores_maps,
             has_pose_errors=evaluator.compares_poses,
-            has_evidence=self.options.mapper == MapperName.FORWARD,
+            has_visits=self.options.mapper == MapperName.FORWARD,
             has_detections=detects,
             has_errors=detects and evaluator.scores_maps,
         )

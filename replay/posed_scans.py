@@ -22,8 +22,8 @@ from replay.timing import StageTimer
 MAX_SWEEP = 1.0
 """The longest plausible sweep (s) in a log of one scan; set by hand."""
 
-MAX_SWEEP_SHARE = 1.5
-"""The longest plausible sweep, as a multiple of the median time from one scan to the next; set by hand."""
+MAX_SWEEP_RATIO = 1.5
+"""The longest plausible sweep over the median time from one scan to the next; set by hand."""
 
 
 class ScanLog:
@@ -52,7 +52,7 @@ class ScanLog:
         decodable, stamps = self._read_stamps()
         self.total = len(stamps)
         gaps = np.diff(np.unique(stamps))
-        self._max_sweep = MAX_SWEEP_SHARE * float(np.median(gaps)) / 1e9 if len(gaps) else MAX_SWEEP
+        self._max_sweep = MAX_SWEEP_RATIO * float(np.median(gaps)) / 1e9 if len(gaps) else MAX_SWEEP
         selected = selection.select(stamps) if self.total else np.zeros(0, dtype=np.intp)
         if not len(selected):
             span = f"{(stamps.max() - stamps.min()) / 1e9:.1f} s" if self.total else "none"

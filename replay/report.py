@@ -11,7 +11,7 @@ from mapping.grid import OccupancyGrid
 from mapping.map_metrics import MapScores
 from prim.metrics import DetectionErrors
 from prim.shapes import Kind
-from replay.detection import DetectionResult
+from replay.detection_stage import DetectionResult
 from replay.notes import pluralize
 from replay.poses.fusion_options import COMPASS, GPS, ODOM
 from replay.poses.laser_poses import FusedSensor, LaserPoses
@@ -22,11 +22,12 @@ UNITS = {ODOM: ("m", "rad"), GPS: ("m",), COMPASS: ("rad",)}
 
 SCHEMA = "prim-replay/1"
 
-MIN_RAY_NOISE = 0.002
-"""The smallest range noise (m) that refinement estimates: its lower bound."""
+MIN_REFINED_NOISE = 0.002
+"""The lower bound of the range noise (m) that refinement estimates, which the table calls «ray noise»."""
 
 MIN_NOISE_CELLS = 1.5
-"""Range noise below this many cells cannot be distinguished from the size of the cells; set by hand."""
+"""The mapper's range noise, which the table calls «range noise», cannot be distinguished from the size of the cells
+where it is below this many; set by hand."""
 
 
 def report_json(result: ReplayResult) -> dict[str, Any]:
@@ -52,7 +53,7 @@ def report_json(result: ReplayResult) -> dict[str, Any]:
             "origin_m": list(frame.origin),
             "cells": [frame.rows, frame.cols],
             "noise_std_m": result.noise_std,
-            "evidence": _evidence(result.grid),
+            "evidence": _visits(result.grid),
             "scores": result.scores.to_json() if result.scores else None,
         },
         "primitives": _primitives(result.detections),
@@ -152,11 +153,11 @@ def _errors(result: DetectionResult | None) -> dict[str, Any] | None:
     }
 
 
-def _evidence(grid: OccupancyGrid) -> dict[str, Any] | None:
+def _visits(grid: OccupancyGrid) -> dict[str, Any] | None:
     """Summarize how many rays the known cells are based on; None for a mapper that does not count them."""
-    if grid.evidence is None:
+    if grid.visits is None:
         return None
-    known = grid.evidence[grid.occupied | grid.free]
+    known = grid.visits[grid.occupied | grid.free]
     quartiles = np.percentile(known, (25, 50, 75)).tolist() if len(known) else [None, None, None]
     return {"cells_known": len(known), "rays_per_cell_quartiles": quartiles}
 
@@ -208,12 +209,16 @@ def _score_rows(scores: MapScores | None) -> Iterator[tuple[str, str]]:
 
 
 def _detection_rows(result: ReplayResult) -> Iterator[tuple[str, str]]:
-    """Yield what was detected, and how it compares with the truth; or why detection was skipped."""
+    """Yield what was detected, and how it compares with the truth; or why detection was skipped.
+
+    «Ray noise» is the range noise that refinement estimated from the rays that meet primitives; «range noise» is that
+    of the mapper.
+    """
     if result.detections is not None:
         yield "primitives", _kind_counts(result.detections)
         noise_std = result.detections.noise_std
         if noise_std is not None and result.options.noise_std is None:
-            bound = "at most " if noise_std <= MIN_RAY_NOISE else ""
+            bound = "at most " if noise_std <= MIN_REFINED_NOISE else ""
             yield "ray noise", f"{bound}{noise_std * 1000:.1f} mm (found on the primitives)"
         if result.detections.errors is not None:
             yield from _error_rows(result.detections.errors)
@@ -260,7 +265,7 @@ def _error_rows(errors: DetectionErrors) -> Iterator[tuple[str, str]]:
 
 
 def _range_noise(std: float, given: bool, resolution: float) -> str:
-    """Describe the range noise; an estimate that is no larger than a cell is mostly the size of the cell."""
+    """Describe the mapper's range noise; an estimate no larger than a cell is mostly the size of the cell."""
     if given:
         return f"{std * 1000:.1f} mm (as given)"
     if std < MIN_NOISE_CELLS * resolution:

@@ -19,7 +19,7 @@ from prim.errors import PrimError
 from prim.metrics import DetectionErrors
 from prim.scan import PosedScan
 from prim.world import World
-from replay.detection import DetectionResult
+from replay.detection_stage import DetectionResult
 from replay.result import ReplayResult
 from replay.viewing.checks import check_display, check_viewer, create_partial, find_free_port, partial_path
 from replay.viewing.drawing import (
@@ -191,8 +191,8 @@ class RerunViewer:
         self._send_batch()
         self._set_time(position, stamp)
         self._recording.log("map/grid", _occupancy_map(grid))
-        if grid.evidence is not None:
-            self._recording.log("evidence/grid", _evidence_map(grid))
+        if grid.visits is not None:
+            self._recording.log("evidence/grid", _visits_map(grid))
         if scores is not None:
             values = [value if (value := getattr(scores, name)) is not None else math.nan for name in SCORES]
             self._recording.log("scores", rr.Scalars(values))
@@ -401,7 +401,7 @@ def _blueprint(scene: Scene) -> rrb.Blueprint:
 
 
 def _map_view(scene: Scene) -> Any:
-    """Lay out the map from above; beside it the evidence, where the mapper has it."""
+    """Lay out the map from above; beside it the visits, where the mapper has it."""
     x0, y0, x1, y1 = scene.bounds
     centre_x, centre_y = (x0 + x1) / 2, (y0 + y1) / 2
     height = 1.1 * max(y1 - y0, x1 - x0) / 2 / math.tan(FIELD_OF_VIEW / 2)
@@ -422,7 +422,7 @@ def _map_view(scene: Scene) -> Any:
         )
 
     view = from_above("map", f"Map ({scene.mapper}), from above")
-    if not scene.has_evidence:
+    if not scene.has_visits:
         return view
     return rrb.Tabs(view, from_above("evidence", "Evidence: rays per cell"), active_tab=0)
 
@@ -468,7 +468,7 @@ def _occupancy_map(grid: OccupancyGrid) -> rr.GridMap:
     return _grid_map(grid, occupancy_percent(grid), rr.components.Colormap.RvizMap)
 
 
-def _evidence_map(grid: OccupancyGrid) -> rr.GridMap:
+def _visits_map(grid: OccupancyGrid) -> rr.GridMap:
     """Draw how many rays came to each cell, on a logarithmic scale."""
     return _grid_map(grid, grid.image()[..., 1], None)
 

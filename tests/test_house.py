@@ -20,13 +20,13 @@ ARROWS: dict[str, set[str]] = {
     "mapping": {"prim", "mapping/forward"},
     "mapping/forward": {"prim", "mapping"},
     "detect/networks": {"prim", "mapping"},
-    "detect/refinement": {"prim", "mapping", "mapping/forward", "detect"},
+    "detect/refinement": {"prim", "mapping", "detect"},
     "detect": {"prim", "mapping", "detect/networks"},
     "detect/training": {
-        "prim", "prim/log", "recorder", "mapping", "mapping/forward", "detect", "detect/networks",
+        "prim", "prim/log", "recorder", "mapping", "detect", "detect/networks",
     },
     "detect/evaluation": {
-        "prim", "recorder", "mapping", "mapping/forward", "detect", "detect/networks", "detect/refinement",
+        "prim", "recorder", "mapping", "detect", "detect/networks", "detect/refinement",
         "detect/training",
     },
     "replay/poses": {"prim", "prim/log", "mapping", "mapping/forward"},
@@ -47,7 +47,7 @@ NARROW = {
 
 ENDS = {
     ("detect/refinement", "detect"): {"detection"},
-    ("replay/viewing", "replay"): {"result", "report", "detection", "evaluation", "notes"},
+    ("replay/viewing", "replay"): {"result", "report", "detection_stage", "replay_evaluator", "notes"},
 }
 """Arrows that lead to these files of a folder alone."""
 
@@ -68,13 +68,13 @@ NAMES_KINDS = {
 NUMBERS = {
     "array layout": (
         "COLUMNS BLOCK CHUNK SHIFT SPACING REACH TABLE_REACH TABLE_SPACING TABLE_MARGIN_CELLS PARAMETERS FIRST_ROOM "
-        "NEAREST MAX_RANGE COLLECTED_ROWS SCRATCH_ROWS BOX ROUND TRIANGLE POLYGON MEASURED TOO_NEAR NO_RETURN "
-        "INVALID CENSORED_MOMENTS HITS PASSES SQUARES_OF_ARRIVAL SKIPPED HIT FREE OCCUPIED UNSEEN MAX_CLEARANCE "
+        "ENTRY_RANGE MAX_RANGE COLLECTED_ROWS SCRATCH_ROWS BOX ROUND TRIANGLE POLYGON MEASURED TOO_NEAR NO_RETURN "
+        "INVALID CENSORED_MOMENTS HITS PASSES SQUARES_OF_ARRIVAL SKIPPED HIT FREE OCCUPIED UNSEEN MAX_DISTANCE "
         "USED REJECTED MIN_BLOCKS MAX_BLOCKS BLOCK_CELLS"
     ),
     "mathematics": "NORMAL_MAD NORMAL_MEDIAN EQUATORIAL_RADIUS FLATTENING OUTLINE_POINTS",
     "rounding and the infinite": "FAR BEHIND ENDLESS EXACT POSITIVE NO_COUNTS TRANSMITTANCE_FLOOR BORDER_SLACK",
-    "definitions": "UNKNOWN_GREY WHITE_EVIDENCE TOLERANCE_CELLS MAX_CELLS",
+    "definitions": "UNKNOWN_GREY WHITE_VISITS TOLERANCE_CELLS MAX_CELLS",
 }
 """The numeric constants that modules of algorithms may have beside their options."""
 

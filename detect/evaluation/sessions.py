@@ -39,9 +39,9 @@ from detect.training.dataset import (
     simulate_session,
 )
 from detect.training.matches import LabelledImage, ScoredBoxes
-from mapping.forward.mapper import cores
 from prim.arrays import FloatArray
 from prim.shapes import Kind, Primitive
+from prim.threads import cores
 
 MIN_PROBABILITY = 0.001
 """Smallest probability that a kind counts with: the score floor of YOLOv5's validation."""
@@ -192,6 +192,6 @@ def _kind_probabilities(detection: Detection) -> dict[Kind, float]:
 
 
 def primitive_box(primitive: Primitive) -> FloatArray:
-    """Return left, top, right, bottom of an outline in cells of 10 mm."""
+    """Return the bounding box (4,) of an outline: x0, y0, x1, y1 in cells of 10 mm."""
     outline = CELLS_PER_METRE * primitive.outline()
     return np.concatenate((outline.min(axis=0), outline.max(axis=0)))

@@ -1,4 +1,4 @@
-"""The parameter networks on ONNX Runtime: from boxes with kinds to primitives."""
+"""The parameter networks on ONNX Runtime: from classified regions to primitives."""
 
 from __future__ import annotations
 
@@ -8,18 +8,19 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from detect.networks.parameters import PRESETS, Box, Preset, crop_box, decode_parameters
+from detect.networks.parameters import PRESETS, Preset, crop_box, decode_parameters
+from detect.networks.tiles import Box
 from detect.networks.weights import Weights, WeightsError
 from mapping.grid import GridFrame
 from prim.shapes import Kind, Primitive
 
 
 @dataclass(frozen=True)
-class BoxedKind:
-    """A box of a tile and the kind of what it bounds.
+class ClassifiedRegion:
+    """A classified region of interest: a box of a tile, and the kind of the primitive that it bounds.
 
     Attributes:
-        grey: Grey image (TILE_SIZE, TILE_SIZE) of the tile.
+        grey: First channel (TILE_SIZE, TILE_SIZE) of the tile's image.
         tile: The tile's frame.
         box: The box, in cells of the tile.
         kind: The kind.
@@ -43,29 +44,29 @@ class ParameterEstimator:
         self._networks = [_Network(weights) for weights in networks]
         self._network_of = {kind: network for network in self._networks for kind in network.kinds}
 
-    def crop(self, boxed: BoxedKind) -> NDArray[np.uint8]:
+    def crop(self, region: ClassifiedRegion) -> NDArray[np.uint8]:
         """Return the input (pixels, pixels) of the kind's network."""
-        return crop_box(boxed.grey, boxed.box, self._network_of[boxed.kind].preset)
+        return crop_box(region.grey, region.box, self._network_of[region.kind].preset)
 
-    def __call__(self, boxed: Sequence[BoxedKind]) -> list[Primitive]:
-        """Estimate the primitives in boxes; they are returned in the order given, map frame.
+    def __call__(self, regions: Sequence[ClassifiedRegion]) -> list[Primitive]:
+        """Estimate the primitives in regions; they are returned in the order given, map frame.
 
         Raises:
             WeightsError: A network gives outputs that are not finite.
         """
         primitives: dict[int, Primitive] = {}
         for network in self._networks:
-            chosen = [i for i in range(len(boxed)) if self._network_of[boxed[i].kind] is network]
+            chosen = [i for i in range(len(regions)) if self._network_of[regions[i].kind] is network]
             if not chosen:
                 continue
-            outputs = network.run(np.stack([self.crop(boxed[i]) for i in chosen]))
+            outputs = network.run(np.stack([self.crop(regions[i]) for i in chosen]))
             if not np.isfinite(outputs).all():
                 raise WeightsError(f"{network.weights.path} gives no numbers for a crop: make it anew")
             for i, row in zip(chosen, outputs.tolist(), strict=True):
-                kind = boxed[i].kind
+                kind = regions[i].kind
                 own = row[network.preset.output_slice(network.kinds, kind)]
-                primitives[i] = decode_parameters(kind, own, network.preset, boxed[i].box, boxed[i].tile)
-        return [primitives[i] for i in range(len(boxed))]
+                primitives[i] = decode_parameters(kind, own, network.preset, regions[i].box, regions[i].tile)
+        return [primitives[i] for i in range(len(regions))]
 
 
 class _Network:

@@ -21,11 +21,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from detect.networks.tiles import Box
 from mapping.grid import UNKNOWN_GREY, GridFrame
 from prim.shapes import Kind, Primitive
-
-Box = tuple[float, float, float, float]
-"""Left, top, right, bottom in cells of a tile; row 0 at the top."""
 
 LENGTH_UNIT = 0.4
 """Unit (m) of outputs that are lengths, which fits the recorder's sizes into 0 to 1; the shipped networks have it."""
@@ -48,7 +46,7 @@ class Preset:
         name: Its name in PRESETS and in model cards.
         window: Side (cells) of the window around the box's centre.
         pixels: Side (pixels) that the window is downsampled to.
-        isolated: Whether all but the box is blanked out as unknown.
+        isolated: Whether all but the box and a rim of one cell around it is blanked out as unknown.
         angle_as_vector: Whether the angle is encoded as cosine and sine.
         has_offset: Whether the centroid's offset from the window's centre is encoded.
     """
@@ -91,8 +89,8 @@ class Preset:
 
     def window_origin(self, box: Box) -> tuple[int, int]:
         """Return column and row of the first cell of the window around a box."""
-        left, top, right, bottom = box
-        return round((left + right - self.window) / 2), round((top + bottom - self.window) / 2)
+        x0, y0, x1, y1 = box
+        return round((x0 + x1 - self.window) / 2), round((y0 + y1 - self.window) / 2)
 
     def window_centre(self, box: Box, tile: GridFrame) -> tuple[float, float]:
         """Return the centre of the window around a box.
@@ -118,7 +116,7 @@ def crop_box(image: NDArray[np.uint8], box: Box, preset: Preset) -> NDArray[np.u
     """Crop an image to the window around a box.
 
     Args:
-        image: Grey image (rows, cols) of a tile; cells beyond it are unknown.
+        image: First channel (rows, cols) of a tile's image; cells beyond it are unknown.
         box: The box, in cells of the tile.
         preset: Size of the window and of the crop.
 
@@ -126,13 +124,13 @@ def crop_box(image: NDArray[np.uint8], box: Box, preset: Preset) -> NDArray[np.u
         The crop (pixels, pixels).
     """
     rows, cols = image.shape
-    left, top, right, bottom = box
+    x0, y0, x1, y1 = box
     col, row = preset.window_origin(box)
     window = np.full((preset.window, preset.window), UNKNOWN_GREY, np.uint8)
     first_col, last_col, first_row, last_row = col, col + preset.window, row, row + preset.window
     if preset.isolated:
-        first_col, last_col = max(first_col, math.floor(left) - 1), min(last_col, math.ceil(right) + 1)
-        first_row, last_row = max(first_row, math.floor(top) - 1), min(last_row, math.ceil(bottom) + 1)
+        first_col, last_col = max(first_col, math.floor(x0) - 1), min(last_col, math.ceil(x1) + 1)
+        first_row, last_row = max(first_row, math.floor(y0) - 1), min(last_row, math.ceil(y1) + 1)
     first_col, last_col = max(first_col, 0), min(last_col, cols)
     first_row, last_row = max(first_row, 0), min(last_row, rows)
     if first_col < last_col and first_row < last_row:
@@ -237,8 +235,8 @@ def decode_parameters(kind: Kind, outputs: Sequence[float], preset: Preset, box:
         x, y = preset.window_centre(box, tile)
         x, y = x + outputs[first] * LENGTH_UNIT, y + outputs[first + 1] * LENGTH_UNIT
         return Primitive(kind, float(x), float(y), theta, size).canonical()
-    left, top, right, bottom = box
-    x, y = (tile.col + (left + right) / 2) * tile.resolution, (tile.row + (top + bottom) / 2) * tile.resolution
+    x0, y0, x1, y1 = box
+    x, y = (tile.col + (x0 + x1) / 2) * tile.resolution, (tile.row + (y0 + y1) / 2) * tile.resolution
     at_origin = Primitive(kind, 0.0, 0.0, theta, size).canonical()
     outline = at_origin.outline()
     centre = (outline.min(axis=0) + outline.max(axis=0)) / 2

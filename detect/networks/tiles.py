@@ -1,4 +1,9 @@
-"""Maps as images of one size: the tiles that YOLO is trained on and runs on."""
+"""Maps as images of one size: the tiles that YOLO is trained on and runs on.
+
+Pixel (row, col) of a tile's image is cell (row, col) of the tile: columns run along x, rows along y, and row 0 is at
+the smallest y, as in every grid here. Boxes have the same axes. A program that draws row 0 at the top shows the map
+upside down.
+"""
 
 from __future__ import annotations
 
@@ -18,12 +23,21 @@ TILE_OVERLAP = 80
 primitive lies whole in some tile."""
 
 STYLES = ("grey", "rounded")
-"""Rendering of cells: ``grey`` is OccupancyGrid.image; ``rounded`` is the paper's (III-A) occupied, free or unknown,
-the same in all three channels."""
+"""How cells are rendered in three channels; model cards hold the names.
+
+``grey`` is OccupancyGrid.image: probability of occupancy, expected visits, known or not. The first channel, all the
+parameter networks read, gave it its name. ``rounded`` is the paper's (III-A): occupied, free or unknown, the same in
+all three channels."""
+
+Box = tuple[float, float, float, float]
+"""x0, y0, x1, y1 in cells along columns and rows, the least first."""
+
+BoxArray = NDArray[np.float32]
+"""(N, 4) boxes: x0, y0, x1, y1 in cells along columns and rows."""
 
 
 def tile_frames(frame: GridFrame) -> Iterator[GridFrame]:
-    """Yield frames of TILE_SIZE x TILE_SIZE cells that cover a map, evenly spaced, overlapping by TILE_OVERLAP."""
+    """Yield frames of tiles that cover a map, evenly spaced, overlapping by at least TILE_OVERLAP."""
     for row in _tile_starts(frame.row, frame.rows):
         for col in _tile_starts(frame.col, frame.cols):
             yield GridFrame(frame.resolution, row, col, TILE_SIZE, TILE_SIZE)
@@ -37,7 +51,7 @@ def _tile_starts(first: int, cells: int) -> list[int]:
     return [first + round(k * (cells - TILE_SIZE) / (count - 1)) for k in range(count)]
 
 
-def crop_to_tile(grid: OccupancyGrid, tile: GridFrame) -> OccupancyGrid | None:
+def clip_to_tile(grid: OccupancyGrid, tile: GridFrame) -> OccupancyGrid | None:
     """Return the part of a map within a tile, as a view.
 
     Args:
@@ -55,7 +69,7 @@ def crop_to_tile(grid: OccupancyGrid, tile: GridFrame) -> OccupancyGrid | None:
         return None
     shared = GridFrame(frame.resolution, row, col, last_row - row, last_col - col)
     part = frame.window(shared)
-    return OccupancyGrid(shared, grid.probability[part], None if grid.evidence is None else grid.evidence[part])
+    return OccupancyGrid(shared, grid.probability[part], None if grid.visits is None else grid.visits[part])
 
 
 def tile_image(grid: OccupancyGrid, tile: GridFrame, style: str = "grey") -> NDArray[np.uint8]:
@@ -67,11 +81,11 @@ def tile_image(grid: OccupancyGrid, tile: GridFrame, style: str = "grey") -> NDA
         style: One of STYLES.
 
     Returns:
-        The image (rows, cols, 3), row 0 at the smallest y.
+        The image (rows, cols, 3).
     """
     image = np.zeros((tile.rows, tile.cols, 3), np.uint8)
     image[..., slice(0, 1) if style == "grey" else slice(None)] = UNKNOWN_GREY
-    part = crop_to_tile(grid, tile)
+    part = clip_to_tile(grid, tile)
     if part is not None:
         image[tile.window(part.frame)] = part.image() if style == "grey" else rounded_image(part)
     return image

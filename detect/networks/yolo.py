@@ -1,4 +1,9 @@
-"""YOLOv5 on ONNX Runtime: from images to candidate boxes with kinds and scores; non-maximum suppression."""
+"""YOLO on ONNX Runtime: from images to candidate boxes with kinds and scores; non-maximum suppression.
+
+The network is YOLOv5n as ultralytics builds it («YOLOv5u»): its head is the anchor-free one of YOLOv8. For each of N
+locations, the cells of three feature maps, its output (4 + K, N) holds a box (centre and size in pixels) and K class
+scores. There are neither anchor boxes nor an objectness, which the original YOLOv5 has.
+"""
 
 from __future__ import annotations
 
@@ -8,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from detect.networks.tiles import TILE_SIZE
+from detect.networks.tiles import TILE_SIZE, BoxArray
 from detect.networks.weights import Weights, WeightsError
 from prim.shapes import Kind
 
@@ -17,16 +22,13 @@ KINDS = tuple(Kind)
 
 CHANNELS = 3
 
-BoxArray = NDArray[np.float32]
-"""(N, 4): left, top, right, bottom in cells; row 0 at the top."""
-
 
 @dataclass(frozen=True)
 class Boxes:
     """Candidates of one image.
 
     Attributes:
-        box: (N, 4) left, top, right, bottom in cells.
+        box: (N, 4) boxes in cells.
         kind: (N,) class indices (of KINDS).
         score: (N,) class scores, 0 to 1.
     """
@@ -63,7 +65,7 @@ class Boxes:
 
 
 class Yolo:
-    """A YOLOv5 network that detects primitives in tiles.
+    """A YOLOv5u network that detects primitives in tiles.
 
     Attributes:
         weights: The network and its model card.
@@ -89,7 +91,7 @@ class Yolo:
         Args:
             images: (N, TILE_SIZE, TILE_SIZE, 3).
             score_floor: Smallest class score of a candidate.
-            multi_label: Whether an anchor is a candidate for each kind that reaches the floor, as in YOLOv5's
+            multi_label: Whether a location is a candidate for each kind that reaches the floor, as in YOLOv5's
                 validation, or for the one with the largest score only.
 
         Returns:
@@ -99,7 +101,7 @@ class Yolo:
             WeightsError: The network does not take the images.
         """
         scaled = np.ascontiguousarray(images.transpose(0, 3, 1, 2), dtype=np.float32) / np.float32(255)
-        return [_decode_anchors(output, self._kinds, score_floor, multi_label) for output in self._run(scaled)]
+        return [_decode_output(output, self._kinds, score_floor, multi_label) for output in self._run(scaled)]
 
     def _run(self, images: NDArray[np.float32]) -> NDArray[np.float32]:
         try:
@@ -109,19 +111,19 @@ class Yolo:
             raise WeightsError(f"{self.weights.path} does not take {expected}: it is no detector") from error
 
 
-def _decode_anchors(
+def _decode_output(
     output: NDArray[np.float32], kinds: NDArray[np.intp], score_floor: float, multi_label: bool
 ) -> Boxes:
-    """Return candidates of one image from output (4 + K, anchors): centre, size, scores of the K ``kinds``."""
+    """Return candidates of one image from output (4 + K, N): centre, size, scores of the K ``kinds``."""
     scores = output[4:]
     if multi_label:
-        kind, anchor = np.nonzero(scores >= score_floor)
+        kind, location = np.nonzero(scores >= score_floor)
     else:
         best = scores.argmax(axis=0)
-        anchor = np.flatnonzero(scores[best, np.arange(scores.shape[1])] >= score_floor)
-        kind = best[anchor]
-    score = scores[kind, anchor]
-    centre, half = output[0:2, anchor].T, output[2:4, anchor].T / 2
+        location = np.flatnonzero(scores[best, np.arange(scores.shape[1])] >= score_floor)
+        kind = best[location]
+    score = scores[kind, location]
+    centre, half = output[0:2, location].T, output[2:4, location].T / 2
     return Boxes(np.concatenate((centre - half, centre + half), axis=1), kinds[kind], score)
 
 

@@ -662,7 +662,7 @@ def occlude(outlines: Any, k: int, p: Any, reach: float, rays: Any) -> None:
         outlines: The kinds' outlines.
         k: The kind's number.
         p: (5,) parameters.
-        reach: The shape's circumradius (m).
+        reach: The shape's bounding radius (m).
         rays: (7, N), changed in place.
     """
     ranges, clearances, scratch = np.empty(BLOCK), np.empty(BLOCK), np.empty((SCRATCH_ROWS, BLOCK))

@@ -109,7 +109,7 @@ class MapCells:
         Returns:
             Their rows and columns.
         """
-        rows, cols, points = _cells_around(self.frame, primitive, primitive.circumradius + margin)
+        rows, cols, points = _cells_around(self.frame, primitive, primitive.bounding_radius + margin)
         at_rows, at_cols = np.nonzero(self.large[rows, cols] & is_within(primitive, points, margin))
         return at_rows + rows.start, at_cols + cols.start
 
@@ -141,7 +141,7 @@ class MapCells:
         occupied = self.occupied.copy()
         touch = min(margin, self.options.touching)
         for primitive in primitives:
-            rows, cols, points = _cells_around(self.frame, primitive, primitive.circumradius + margin)
+            rows, cols, points = _cells_around(self.frame, primitive, primitive.bounding_radius + margin)
             near, touching = (is_within(primitive, points, reach) for reach in (margin, touch))
             occupied[rows, cols] &= ~np.where(self.large[rows, cols], touching, near)
         return occupied

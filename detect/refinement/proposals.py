@@ -38,14 +38,14 @@ def propose(
     """
     made = []
     centroids = np.array([(primitive.x, primitive.y) for primitive in known]).reshape(-1, 2)
-    reaches = np.array([primitive.circumradius + options.near for primitive in known])
+    reaches = np.array([primitive.bounding_radius + options.near for primitive in known])
     for points in components(cells, options):
         around = bounding_rectangle(points, cells.frame.resolution, options)
         if around is None or cells.hides_centroid(around):
             continue
         inside = np.zeros(len(points), np.bool_)
         apart = np.hypot(*(centroids - (around.x, around.y)).T)
-        for near in np.flatnonzero(apart < reaches + around.circumradius).tolist():
+        for near in np.flatnonzero(apart < reaches + around.bounding_radius).tolist():
             inside |= is_within(known[near], points, options.near)
         if inside.mean() <= options.max_covered:
             made.append((len(points), around))

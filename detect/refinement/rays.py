@@ -224,7 +224,7 @@ def collect_rays(
         A bundle for each primitive, the largest span of ranges (m), and an upper bound of the noise (m).
     """
     centres = np.array([(primitive.x, primitive.y) for primitive in primitives]).reshape(-1, 2)
-    radii = np.array([primitive.circumradius + reach for primitive in primitives])
+    radii = np.array([primitive.bounding_radius + reach for primitive in primitives])
     collector = RayCollector(centres, radii, options)
     for scan, pose in scans:
         collector.add(scan, pose)

@@ -35,7 +35,7 @@ from detect.refinement.sensor_estimation import estimate_noise, estimate_sensor,
 from detect.refinement.sensor_model import Background, BeamModel, DistanceMap, surface_likelihood
 from mapping.grid import OccupancyGrid
 from prim.arrays import FloatArray
-from prim.metrics import shared_area
+from prim.metrics import overlap_coefficient
 from prim.scan import Scan
 from prim.se2 import Pose2D
 from prim.shapes import Kind, Primitive
@@ -177,7 +177,7 @@ def _missing(before: Detections, now: Detections, limits: AcceptanceOptions) -> 
     return [
         detection
         for detection in before.found
-        if all(shared_area(detection.primitive, other) <= limits.min_shared for other in found)
+        if all(overlap_coefficient(detection.primitive, other) <= limits.min_shared for other in found)
     ]
 
 
@@ -186,7 +186,7 @@ def _known_before(wanted: Sequence[Detection], before: Detections, limits: Accep
     sure = [detection for detection in before.found if detection.score >= limits.sure]
     known = {}
     for number, detection in enumerate(wanted):
-        shared = [(shared_area(detection.primitive, other.primitive), other) for other in sure]
+        shared = [(overlap_coefficient(detection.primitive, other.primitive), other) for other in sure]
         same = [pair for pair in shared if pair[0] > limits.min_shared]
         if same:
             known[number] = max(same, key=lambda pair: pair[0])[1]
@@ -248,7 +248,7 @@ def proposal_rejection_reason(
         return f"{prefix}only {result.seen:.0%} of its outline is seen, less than {limits.min_seen:.0%}"
     if cells.is_behind_extended_wall(result.primitive):
         return f"{prefix}it reaches into a wall"
-    if shared_area(result.primitive, guess) < limits.min_shared:
+    if overlap_coefficient(result.primitive, guess) < limits.min_shared:
         return f"{prefix}what explains its rays stands elsewhere"
     if result.score < limits.min_chance:
         return f"{prefix}its kind is sure by {result.score:.2f} only, less than {limits.min_chance:g}"
@@ -382,7 +382,7 @@ def without_duplicates(
     stay: list[Candidate] = []
     for candidate in sorted(candidates, key=lambda item: -ratios[id(item)]):
         limit = candidate.options.acceptance.max_shared
-        if all(shared_area(candidate.current, other.current) <= limit for other in stay):
+        if all(overlap_coefficient(candidate.current, other.current) <= limit for other in stay):
             stay.append(candidate)
     return stay
 

@@ -204,7 +204,7 @@ def with_background(
     rays[OCCLUSION] = FAR
     rays[BACKGROUND] = log_likelihood
     for other in occluders:
-        occlude(OUTLINES, NUMBERS[other.kind], parameters_of(other), other.circumradius, rays)
+        occlude(OUTLINES, NUMBERS[other.kind], parameters_of(other), other.bounding_radius, rays)
     apply_occlusion(RayData(rays, bundle.outcomes, sensor.std, sensor.table), background.ranges, background.blocked)
     return bundle.with_rays(rays)
 

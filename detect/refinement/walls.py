@@ -76,9 +76,9 @@ def walls_behind(
     centroids = np.array([(candidate.x, candidate.y) for candidate in candidates])
     made = []
     for candidate, guess in zip(candidates, guesses, strict=True):
-        reach = candidate.circumradius + options.around
+        reach = candidate.bounding_radius + options.around
         near = points[_in_square(candidate, points, reach)]
-        close = near[_in_square(candidate, near, candidate.circumradius + options.near)]
+        close = near[_in_square(candidate, near, candidate.bounding_radius + options.near)]
         if not is_within(candidate, close, options.near).any():
             continue
         for other in np.flatnonzero(_in_square(candidate, centroids, 2 * reach)).tolist():
@@ -110,7 +110,7 @@ def _stretch(
     on_line = points[distance_to_line(points, line) < (options.width + 0.5) * resolution]
     along = on_line @ np.array([-ny, nx])
     middle = -ny * candidate.x + nx * candidate.y
-    reach, beyond = candidate.circumradius, options.beyond
+    reach, beyond = candidate.bounding_radius, options.beyond
     left, right = along[along < middle - 0.5 * reach], along[along > middle + 0.5 * reach]
     lengths = (len(np.unique(np.rint(part / resolution))) for part in (left, right))
     if min(lengths) * resolution < options.min_length:

@@ -9,7 +9,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from detect.networks.parameters import Box, Preset, crop_box
+from detect.networks.parameters import Preset, crop_box
+from detect.networks.tiles import Box
 from detect.training.dataset import Sample, bounding_box
 from mapping.grid import GridFrame
 from prim.shapes import Kind, Primitive
@@ -104,10 +105,10 @@ def jitter_box(box: Box, rng: np.random.Generator) -> Box:
     Returns:
         The jittered box.
     """
-    left, top, right, bottom = box
-    dx, dy = JITTER * (right - left), JITTER * (bottom - top)
+    x0, y0, x1, y1 = box
+    dx, dy = JITTER * (x1 - x0), JITTER * (y1 - y0)
     moves = rng.uniform(-1, 1, 4) * (dx, dy, dx, dy)
-    return left + moves[0], top + moves[1], right + moves[2], bottom + moves[3]
+    return x0 + moves[0], y0 + moves[1], x1 + moves[2], y1 + moves[3]
 
 
 def mirror(primitive: Primitive) -> Primitive:

@@ -27,8 +27,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from detect.networks.parameters import Box
-from detect.networks.tiles import TILE_SIZE, tile_frames, tile_image
+from detect.networks.tiles import TILE_SIZE, Box, tile_frames, tile_image
 from detect.networks.weights import KIND_NAMES
 from detect.networks.yolo import KINDS
 from mapping.grid import GridFrame, OccupancyGrid
@@ -348,11 +347,11 @@ def bounding_box(primitive: Primitive, tile: GridFrame) -> Box:
         tile: The tile's frame.
 
     Returns:
-        Left, top, right, bottom in cells of the tile; row 0 at the top.
+        The box, in cells of the tile.
     """
     cells = primitive.outline() / tile.resolution - (tile.col, tile.row)
-    (left, top), (right, bottom) = np.clip(cells.min(axis=0), 0, TILE_SIZE), np.clip(cells.max(axis=0), 0, TILE_SIZE)
-    return float(left), float(top), float(right), float(bottom)
+    (x0, y0), (x1, y1) = np.clip(cells.min(axis=0), 0, TILE_SIZE), np.clip(cells.max(axis=0), 0, TILE_SIZE)
+    return float(x0), float(y0), float(x1), float(y1)
 
 
 def write_image(path: Path, image: NDArray[np.uint8]) -> None:

@@ -19,8 +19,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from detect.networks.parameters import Box
-from detect.networks.tiles import TILE_SIZE
+from detect.networks.tiles import TILE_SIZE, Box
 from detect.training.dataset import SPLITS, Progress, bounding_box, write_data_yaml, write_image, yolo_label
 from mapping.grid import UNKNOWN_GREY, GridFrame
 from prim.errors import UsageError
@@ -140,8 +139,8 @@ def draw_primitives(rng: np.random.Generator) -> tuple[NDArray[np.uint8], list[P
         grey = np.select((probability > 0.5, probability < 0.5), (np.uint8(255), np.uint8(0)), np.uint8(UNKNOWN_GREY))
         return np.repeat(grey[..., None], 3, axis=2), primitives
     shown = np.where(known, np.uint8(255), np.uint8(0))
-    evidence = (shown * rng.uniform(0.3, 1.0)).astype(np.uint8)
-    return np.stack((np.rint(probability * 255).astype(np.uint8), evidence, shown), axis=-1), primitives
+    visits = (shown * rng.uniform(0.3, 1.0)).astype(np.uint8)
+    return np.stack((np.rint(probability * 255).astype(np.uint8), visits, shown), axis=-1), primitives
 
 
 def _place_primitives(rng: np.random.Generator) -> list[Primitive]:
@@ -184,17 +183,17 @@ def _are_apart(a: Box, b: Box) -> bool:
 
 
 def _draw_room(rng: np.random.Generator) -> Box:
-    """Draw left, top, right, bottom (cells) of the room, whose cells are known."""
-    left, top, right, bottom = rng.uniform(2, 16, 4)
-    return float(left), float(top), float(TILE_SIZE - right), float(TILE_SIZE - bottom)
+    """Draw the box of the room, whose cells are known: its margins to the tile's borders (cells) are uniform."""
+    x0, y0, x1, y1 = rng.uniform(2, 16, 4)
+    return float(x0), float(y0), float(TILE_SIZE - x1), float(TILE_SIZE - y1)
 
 
 def _sample_points(primitives: list[Primitive], room: Box, rng: np.random.Generator) -> NDArray[np.float64]:
     """Sample points (N, 2) in cells on the outlines and, in most drawings, the walls; gaps, noise, speckles."""
     lines = [primitive.outline() / RESOLUTION for primitive in primitives]
     if rng.random() < 0.7:
-        left, top, right, bottom = room
-        lines.append(np.array([(left, top), (right, top), (right, bottom), (left, bottom)]))
+        x0, y0, x1, y1 = room
+        lines.append(np.array([(x0, y0), (x1, y0), (x1, y1), (x0, y1)]))
     spread = 0.0 if rng.random() < 0.35 else rng.uniform(0.2, 6.0)
     density = rng.uniform(1.0, 8.0)
     parts = [np.empty((0, 2))]

@@ -93,7 +93,7 @@ def export_yolo(
     style: str = "grey",
     about: Mapping[str, Any] | None = None,
 ) -> ModelCard:
-    """Export YOLO's weights: images (N, 3, rows, cols) to boxes and scores (N, 4 + kinds, anchors).
+    """Export YOLO's weights: images (N, 3, rows, cols) to boxes and scores (N, 4 + kinds, locations).
 
     Args:
         weights: Weights of ultralytics: a pickle, which can run code when it is loaded.

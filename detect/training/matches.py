@@ -8,8 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from detect.networks.cnn import BoxedKind
-from detect.networks.yolo import KINDS, BoxArray, Boxes, box_iou
+from detect.networks.cnn import ClassifiedRegion
+from detect.networks.tiles import BoxArray
+from detect.networks.yolo import KINDS, Boxes, box_iou
 from detect.training.dataset import Sample, bounding_box
 from prim.arrays import FloatArray
 
@@ -48,12 +49,12 @@ class LabelledImage:
     image: NDArray[np.uint8]
 
     @property
-    def true_boxes(self) -> list[BoxedKind]:
+    def true_boxes(self) -> list[ClassifiedRegion]:
         """The true boxes as the parameter estimator takes them."""
         grey = np.ascontiguousarray(self.image[..., 0])
         frame = self.sample.frame
         return [
-            BoxedKind(grey, frame, bounding_box(primitive, frame), primitive.kind)
+            ClassifiedRegion(grey, frame, bounding_box(primitive, frame), primitive.kind)
             for primitive in self.sample.primitives
         ]
 

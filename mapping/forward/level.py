@@ -1,6 +1,6 @@
 """One resolution level of the forward mapper: its rays, its parameters, and its E and M steps.
 
-The sensor model and the E step's kernel are in :mod:`mapping.forward.likelihood`, the prior and the M step's kernel
+The sensor model and the E step's kernel are in :mod:`mapping.forward.likelihood`, the sieve and the M step's kernel
 in :mod:`mapping.forward.sieve`.
 """
 
@@ -31,7 +31,7 @@ from mapping.forward.likelihood import (
     noise_tables,
 )
 from mapping.forward.options import DEFAULTS, ForwardOptions
-from mapping.forward.sieve import blur, gaussian_kernel, kernel_sums, maximize, normalize, reduce_blocks
+from mapping.forward.sieve import convolve, gaussian_kernel, kernel_sums, maximize, normalize, reduce_blocks
 from mapping.grid import GridFrame
 from mapping.kernels import Fields
 from mapping.morphology import dilate
@@ -45,7 +45,7 @@ all. The number depends on the grid alone, and blocks are added up in order, so 
 same bits."""
 
 COLUMNS = 3
-"""Columns of the E step's sums with certainty; without it there is one less."""
+"""Columns of the E step's sums with SQUARES_OF_ARRIVAL; without it there is one less."""
 
 _TABLE = noise_tables()
 _NO_SKIPS = np.zeros(0, np.int32)
@@ -65,10 +65,13 @@ class RangeNoise(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class SufficientStatistics:
-    """Sums over the rays of an E step, sufficient for the M step of the range noise.
+    """Expected complete-data sufficient statistics of the range noise: what its M step needs of an E step.
+
+    Stops, squares and outliers are expectations under the responsibilities; the log-likelihood is that of the
+    observed ranges.
 
     Attributes:
-        log_likelihood: Log-likelihood of the rays (nats).
+        log_likelihood: Log-likelihood of the rays' measurements (nats).
         rays: Number of rays that cross the grid.
         stops: Expected number of rays that stop in the grid.
         squares: Expected sum of their squared residuals (z - s)^2, in sigma^2.
@@ -249,7 +252,8 @@ class Level:
         self.stopping = self.parameters.copy()
         self._active = np.ones(frame.shape, np.bool_)
         self._skip: NDArray[np.int32] | None = None
-        self._hits, self._passes, self._blurred, self._scratch = (np.empty(frame.shape, np.float32) for _ in range(4))
+        arrays = (np.empty(frame.shape, np.float32) for _ in range(4))
+        self._hits, self._passes, self._convolved, self._scratch = arrays
         self._bounds = np.float32(options.min_stopping), np.float32(options.max_stopping)
         self._geometry = geometry_fields(frame)
         self.blocks = max(MIN_BLOCKS, min(MAX_BLOCKS, BLOCK_CELLS // (frame.rows * frame.cols)))
@@ -283,7 +287,10 @@ class Level:
         self._update_stopping()
 
     def fix_free_cells(self, rays: RayStore) -> None:
-        """Fix cells with a negligible stopping probability at 0, and skip them where these rays begin."""
+        """Fix negligible parameters p at 0, and let these rays begin at the first cell that others contribute to.
+
+        The stopping probability of the cells that are skipped is its lower bound, ``min_stopping``.
+        """
         self._active = self.parameters > self.options.negligible_stopping
         self.parameters[~self._active] = 0
         marked = dilate(self._active, len(self._kernel) // 2)
@@ -301,7 +308,7 @@ class Level:
         self._skip = None
 
     def expect(
-        self, rays: RayStore, noise: RangeNoise, subset: RaySubset = ALL_RAYS, with_certainty: bool = False
+        self, rays: RayStore, noise: RangeNoise, subset: RaySubset = ALL_RAYS, with_arrival: bool = False
     ) -> tuple[NDArray[np.float32], SufficientStatistics]:
         """Compute the E step.
 
@@ -309,13 +316,13 @@ class Level:
             rays: All rays.
             noise: The range noise.
             subset: The rays that are taken.
-            with_certainty: Whether the sums get a third column.
+            with_arrival: Whether the sums get a third column, SQUARES_OF_ARRIVAL.
 
         Returns:
             The sums (blocks, rows * cols, 2 or 3) per cell, as :func:`mapping.forward.likelihood.expect` fills them;
             and the sums over rays.
         """
-        sums = np.zeros((self.blocks, self.parameters.size, COLUMNS if with_certainty else COLUMNS - 1), np.float32)
+        sums = np.zeros((self.blocks, self.parameters.size, COLUMNS if with_arrival else COLUMNS - 1), np.float32)
         totals = np.zeros((self.blocks, 6))
         skip = self._skip if self._skip is not None else _NO_SKIPS
         arrays, sensor = rays.arrays, sensor_fields(noise, self.options.ray_model)
@@ -342,8 +349,8 @@ class Level:
         reduce_blocks(sums, self.stopping, self._row_sums, self._col_sums, self._hits, self._passes)
         if len(self._kernel) > 1:
             for array in (self._hits, self._passes):
-                blur(array, self._kernel, self._scratch, self._blurred)
-                array[:] = self._blurred
+                convolve(array, self._kernel, self._scratch, self._convolved)
+                array[:] = self._convolved
         maximize(self.parameters, self._active, self._hits, self._passes, power, self._bounds)
         self._update_stopping()
 
@@ -352,7 +359,7 @@ class Level:
         if len(self._kernel) == 1:
             np.clip(self.parameters, *self._bounds, out=self.stopping)
             return
-        blur(self.parameters, self._kernel, self._scratch, self.stopping)
+        convolve(self.parameters, self._kernel, self._scratch, self.stopping)
         normalize(self.stopping, self._row_sums, self._col_sums, self._bounds)
 
     def _in_blocks(self, run: Callable[[int, int, int], None], begin: int, end: int) -> None:
@@ -396,8 +403,8 @@ def smoothing_width(std: float, resolution: float, options: ForwardOptions = DEF
     return options.smoothing * math.sqrt(std * resolution)
 
 
-def evidence_and_certainty(sums: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Return the evidence and the certainty of each cell, see :class:`mapping.forward.mapper.ForwardFit`.
+def visits_and_arrival_probability(sums: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Return each cell's expected visits and arrival probability, see :class:`mapping.forward.mapper.ForwardFit`.
 
     Args:
         sums: The E step's sums (blocks, rows * cols, 3).
@@ -406,5 +413,5 @@ def evidence_and_certainty(sums: NDArray[np.float32]) -> tuple[NDArray[np.float3
         Both (rows * cols,).
     """
     added = sums.sum(axis=0)
-    evidence = added[:, HITS] + added[:, PASSES]
-    return evidence, added[:, SQUARES_OF_ARRIVAL] / np.maximum(evidence, np.float32(1e-9))
+    visits = added[:, HITS] + added[:, PASSES]
+    return visits, added[:, SQUARES_OF_ARRIVAL] / np.maximum(visits, np.float32(1e-9))

@@ -1,9 +1,10 @@
 """Compiled kernels of the forward sensor model: likelihoods of ranges, and the E step of expectation-maximisation.
 
-The model. Each cell c has a stopping probability o_c: that of a ray that enters the cell to end there. A ray crosses
-cells k = 0, 1, ..., one for each step along its major axis, whose centres lie at distances s_k along the ray. It
-reaches cell k with the transmittance T_k = prod_{j < k} (1 - o_j), and ends there with probability T_k o_k. A ray
-that ends at distance s is measured as z ~ N(s, sigma^2). With the share epsilon of outliers, z has the density
+The model. Each cell c has a stopping probability o_c: that of a ray that enters the cell to end there, whatever the
+length of its path in it (one Bernoulli trial for each ray and cell). A ray crosses cells k = 0, 1, ..., one for each
+step along its major axis, whose centres lie at distances s_k along the ray. It reaches cell k with the transmittance
+T_k = prod_{j < k} (1 - o_j), and ends there with probability T_k o_k. A ray that ends at distance s is measured as
+z ~ N(s, sigma^2). With the share epsilon of outliers, z has the density
 
     p(z) = (1 - epsilon) [sum_k T_k o_k N(z; s_k, sigma) + T_exit E(z) + B(z)] + epsilon O(z).
 
@@ -32,6 +33,7 @@ from numpy.typing import NDArray
 from mapping.kernels import Fields
 from prim.arrays import FloatArray
 from prim.compiled import compiled, inline, kernel
+from prim.normal import normal_table
 
 SHIFT = 32
 ONE = float(1 << SHIFT)
@@ -67,7 +69,7 @@ CENSORED_MOMENTS = 2
 HITS, PASSES, SQUARES_OF_ARRIVAL = 0, 1, 2
 """Columns of an E step's sums per cell."""
 
-LOG_LIKELIHOOD, STOPS, SQUARES, OUTLIERS, RAYS, VISITS = range(6)
+LOG_LIKELIHOOD, STOPS, SQUARES, OUTLIERS, RAYS, TRACED_CELLS = range(6)
 """Entries of an E step's totals over rays."""
 
 ROOT_HALF = math.sqrt(0.5)
@@ -181,9 +183,7 @@ def noise_tables() -> NDArray[np.float32]:
         second moments of the noise, in sigma^2, given that the range is censored below or above (moments of the
         truncated normal distribution).
     """
-    x = np.arange(-REACH * SPACING, REACH * SPACING + 1) / SPACING
-    density = np.exp(-(x**2) / 2)
-    below = np.array([0.5 * math.erfc(value * ROOT_HALF) for value in x])
+    x, density, below = normal_table(REACH, SPACING)
     above = below[::-1]
     moment_below = 1 + x * density * PEAK / below
     return np.stack([density, below, above, moment_below, moment_below[::-1]]).astype(np.float32)
@@ -515,7 +515,7 @@ def moments_censored(row: int, count: int, factor: Any, table: Any, scratch: Ray
 
 
 @part
-def scatter(count: int, behind: Any, scratch: RayScratch, sums: Any, with_certainty: bool) -> None:
+def scatter(count: int, behind: Any, scratch: RayScratch, sums: Any, with_arrival: bool) -> None:
     """Add a ray's responsibilities to its cells, from the last one back.
 
     Args:
@@ -523,7 +523,7 @@ def scatter(count: int, behind: Any, scratch: RayScratch, sums: Any, with_certai
         behind: Responsibility of what lies behind the last cell.
         scratch: The ray's ``cells`` and responsibilities.
         sums: Changed in place, see :func:`expect`.
-        with_certainty: Whether the third column of ``sums`` is filled.
+        with_arrival: Whether the third column of ``sums``, SQUARES_OF_ARRIVAL, is filled.
     """
     cells, responsibility = scratch.cells, scratch.weight
     for i in range(count - 1, -1, -1):
@@ -533,7 +533,7 @@ def scatter(count: int, behind: Any, scratch: RayScratch, sums: Any, with_certai
         sums[c, HITS] += q
         sums[c, PASSES] += behind
         behind += q
-        if with_certainty:
+        if with_arrival:
             sums[c, SQUARES_OF_ARRIVAL] += behind * behind
 
 
@@ -693,13 +693,13 @@ def place_laser(pose: Any, mount: Any, steps: Any, k: int, grid: GridGeometry, p
 
 
 @inline
-def add_score(a: float, b: float, c: float, result: Any) -> None:
-    """Add one ray's score, and its outer product, to the result of :func:`pose_likelihood`.
+def add_gradient(a: float, b: float, c: float, result: Any) -> None:
+    """Add one ray's gradient, and its outer product, to the result of :func:`pose_likelihood`.
 
     Args:
-        a: The score's component along x.
-        b: The score's component along y.
-        c: The score's component along the heading.
+        a: The gradient's component along x.
+        b: The gradient's component along y.
+        c: The gradient's component along the heading.
         result: Changed in place (11,).
     """
     result[1] += a
@@ -723,10 +723,10 @@ def pose_likelihood(
     sensor: Fields,
     result: Any,
 ) -> None:
-    """Compute the log-likelihood of a scan from a pose of the robot, its score and its information.
+    """Compute the log-likelihood of a scan from a pose of the robot, its gradient, and rays' outer products.
 
-    Derivatives are central differences. The information is the sum of products of single rays' scores (Berndt, Hall,
-    Hall and Hausman 1974). A ray that misses the grid counts as an outlier.
+    Derivatives are central differences. The outer products are those of single rays' gradients (Berndt, Hall, Hall
+    and Hausman 1974); the caller centres their sum. A ray that misses the grid counts as an outlier.
 
     Args:
         rays: (N, 5) float64, in the frame of the laser: where each beam starts (x, y), its direction, its range (m).
@@ -736,15 +736,15 @@ def pose_likelihood(
         geometry: Fields of :class:`GridGeometry`.
         stopping: Stopping probabilities (rows, cols) float32.
         sensor: Fields of :class:`SensorModel`.
-        result: Filled (11,): log-likelihood, score (3), information xx, xy, xt, yy, yt, tt, number of rays that cross
-            the grid.
+        result: Filled (11,): log-likelihood, gradient (3), sums of the rays' outer products xx, xy, xt, yy, yt, tt,
+            number of rays that cross the grid.
     """
     pose, mount, steps = placement
     grid = GridGeometry(*geometry)
     scratch = make_scratch(stopping.shape[0], stopping.shape[1])
     per_metre, model = 1 / grid.resolution, in_cells(sensor, grid.resolution)
     cells = (limits[0] * per_metre, limits[1] * per_metre)
-    score, places = np.empty(3), np.empty((7, 4))
+    gradient, places = np.empty(3), np.empty((7, 4))
     result[:] = 0.0
     evaluations = 7 if steps[0] > 0 else 1
     for k in range(evaluations):
@@ -766,13 +766,13 @@ def pose_likelihood(
             if k == 0:
                 here, counts = log_density, count >= 0
             elif k % 2:
-                score[(k - 1) // 2] = log_density
+                gradient[(k - 1) // 2] = log_density
             else:
-                score[(k - 1) // 2] = (score[(k - 1) // 2] - log_density) / (2 * steps[(k - 1) // 2])
+                gradient[(k - 1) // 2] = (gradient[(k - 1) // 2] - log_density) / (2 * steps[(k - 1) // 2])
         result[0] += here
         result[10] += counts
         if evaluations > 1:
-            add_score(score[0], score[1], score[2], result)
+            add_gradient(gradient[0], gradient[1], gradient[2], result)
 
 
 @kernel
@@ -793,17 +793,18 @@ def expect(
         selection: Fields of :class:`RaySlice`.
         geometry: Fields of :class:`GridGeometry`.
         stopping: Stopping probabilities (rows, cols) float32.
-        skip: Per ray (N,) int32 the number of its first cells that are skipped, since they stop and receive nothing;
-            empty: none.
+        skip: Per ray (N,) int32 the number of its first cells that are skipped: they receive nothing, and what little
+            they stop is neglected; empty: none.
         sensor: Fields of :class:`SensorModel`.
         sums: (rows * cols, 2 or 3) float32, added to: expected HITS and PASSES and, where there is a third column,
             the sum of squares of the rays' probabilities to have reached the cell (SQUARES_OF_ARRIVAL).
         totals: (6,) float64, added to: LOG_LIKELIHOOD, the expected number of STOPS in the grid, their SQUARES
-            ((z - s)^2 in sigma^2), the expected number of OUTLIERS, RAYS that cross the grid, and VISITS of cells.
+            ((z - s)^2 in sigma^2), the expected number of OUTLIERS, RAYS that cross the grid, and their
+            TRACED_CELLS.
     """
     scans, first_rays, rays = arrays
     subset, grid = RaySlice(*selection), GridGeometry(*geometry)
-    with_certainty = sums.shape[1] > 2
+    with_arrival = sums.shape[1] > 2
     scratch = make_scratch(stopping.shape[0], stopping.shape[1])
     per_metre, model = 1 / grid.resolution, in_cells(sensor, grid.resolution)
     scan = np.searchsorted(first_rays, subset.begin, side="right") - 1
@@ -825,13 +826,13 @@ def expect(
             stops, squares = moments_measured(count, factor, scratch)
         else:
             stops, squares = moments_censored(CENSORED_MOMENTS + kind, count, factor, model.table, scratch)
-        scatter(count, np.float32(behind * weight), scratch, sums, with_certainty)
+        scatter(count, np.float32(behind * weight), scratch, sums, with_arrival)
         totals[LOG_LIKELIHOOD] += math.log(density * per_metre if kind == MEASURED else density)
         totals[STOPS] += stops
         totals[SQUARES] += squares
         totals[OUTLIERS] += outlier / density
         totals[RAYS] += 1
-        totals[VISITS] += count
+        totals[TRACED_CELLS] += count
 
 
 @kernel

@@ -1,12 +1,19 @@
-"""The forward mapper: a forward sensor model fitted to all rays by expectation-maximisation (after Thrun 2003).
+"""The forward mapper: a forward sensor model fitted to all rays by expectation-maximisation.
 
-The map is a field of stopping probabilities o_c, one per cell: the probability that a ray that enters the cell ends
-there. Map and range noise (sigma, epsilon) maximise the likelihood of all measured ranges together. An inverse sensor
-model updates each cell on its own and blurs the map by the noise; here the map stays sharp where the noise is far
-larger than a cell.
+The map is a reflection map with noisy ranges. Each cell c has a stopping probability o_c: that of a ray that crosses
+the cell to end there. It is one Bernoulli trial for each ray and cell, where a ray crosses one cell for each step
+along its major axis, whatever the length of its path in it. If ranges were exact, the maximum-likelihood map would be
+the counting model, hits / (hits + passes) (Hähnel, Triebel, Burgard and Thrun 2003). With noise, which cell stopped a
+ray is latent: map and range noise (sigma, epsilon) maximise the likelihood of all measured ranges together. The
+latent correspondences and their expectation-maximisation are those of Thrun («Learning occupancy grid maps with
+forward sensor models», 2003). His cells are binary, and a search flips them; here they hold probabilities, which
+the M step gives in closed form.
 
-:mod:`~mapping.forward.likelihood` is the sensor model and the E step, :mod:`~mapping.forward.sieve` the prior and the
-M step, :mod:`~mapping.forward.level` both on one resolution. This module is the schedule:
+An inverse sensor model updates each cell on its own and blurs the map by the noise; here the map stays sharp where
+the noise is far larger than a cell.
+
+:mod:`~mapping.forward.likelihood` is the sensor model and the E step, :mod:`~mapping.forward.sieve` the restriction
+to smooth maps and the M step, :mod:`~mapping.forward.level` both on one resolution. This module is the schedule:
 
 - :meth:`ForwardMapper.fit`: over-relaxed expectation-maximisation (Salakhutdinov and Roweis 2003) from coarse to
   fine; then the range noise from held-out rays, since a map also fits a part of the noise of its own rays; then the
@@ -20,10 +27,8 @@ M step, :mod:`~mapping.forward.level` both on one resolution. This module is the
 from __future__ import annotations
 
 import math
-import os
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
 from dataclasses import dataclass
 
 import numpy as np
@@ -40,15 +45,17 @@ from mapping.forward.level import (
     RaySubset,
     SufficientStatistics,
     coarse_cell_index,
-    evidence_and_certainty,
     smoothing_width,
+    visits_and_arrival_probability,
 )
 from mapping.forward.options import DEFAULTS, ForwardOptions
 from mapping.grid import UNKNOWN, GridFrame, GrowingGrid, OccupancyGrid
 from mapping.kernels import hit_extent, scan_arrays
+from mapping.range_noise import neighbour_noise
 from prim.errors import UsageError
 from prim.scan import Scan
 from prim.se2 import Pose2D
+from prim.threads import cores, worker_pool
 from prim.world import Bounds
 
 
@@ -59,35 +66,37 @@ class ForwardFit:
     Attributes:
         frame: Where the cells lie.
         stopping: Stopping probabilities.
-        evidence: Expected number of rays that reached the cell: hits and passes.
-        certainty: Mean probability, over those, to have reached the cell.
+        visits: Expected number of rays that reached the cell, its hits and passes: sum(a) over the rays, with a the
+            posterior probability that the ray reached the cell.
+        arrival_probability: The mean of a, weighted by a itself: sum(a^2) / sum(a). It is no confidence in the map.
         noise: The range noise.
     """
 
     frame: GridFrame
     stopping: NDArray[np.float32]
-    evidence: NDArray[np.float32]
-    certainty: NDArray[np.float32]
+    visits: NDArray[np.float32]
+    arrival_probability: NDArray[np.float32]
     noise: RangeNoise
 
     def grid(self, options: CalibrationOptions = CALIBRATION) -> OccupancyGrid:
         """Return the calibrated probabilities of occupancy."""
         noise_cells = self.noise.std / self.frame.resolution
-        probability = occupancy(self.stopping, self.certainty, self.evidence, noise_cells, options)
-        return OccupancyGrid(self.frame, probability, self.evidence)
+        probability = occupancy(self.stopping, self.arrival_probability, self.visits, noise_cells, options)
+        return OccupancyGrid(self.frame, probability, self.visits)
 
 
 class ForwardMapper:
     """Mapper that fits stopping probabilities and the range noise to all rays together.
 
     While scans stream in, :meth:`update` keeps a coarser map up to date with a bounded amount of work per scan, and
-    :meth:`grid` returns that one. :meth:`finish` fits all rays from coarse to fine until convergence; its result does
-    not depend on the streaming map, nor on the number of threads.
+    :meth:`grid` returns that one. :meth:`finish` fits all rays from coarse to fine, until convergence or the options'
+    limits of passes; its result does not depend on the streaming map, nor on the number of threads.
 
     Attributes:
         resolution: Side of a cell (m).
         options: The mapper's options.
-        history: Of the last fit, per pass the level's factor and the E step's statistics.
+        history: Of the last fit, the level's factor and the E step's statistics of passes on rays of the fit. Passes
+            that showed that the step before was to be undone, or that the level had converged, are left out.
     """
 
     name = "forward"
@@ -107,7 +116,8 @@ class ForwardMapper:
             resolution: Side of a cell (m).
             bounds: X0, y0, x1, y1 (m) of the map; None: it grows with the scans.
             noise_std: Standard deviation of the range noise (m), held fixed; None: it is estimated.
-            start_std: Its initial value (m) where it is estimated; None: what neighbouring beams show.
+            start_std: Its initial value (m) where it is estimated, bounded by what neighbouring beams show and by
+                ``max_start_ratio`` times that; None: what they show.
             threads: Number of threads; None: one for each available core.
             options: The mapper's options.
 
@@ -134,8 +144,10 @@ class ForwardMapper:
     def noise_std(self) -> float | None:
         """Standard deviation of the range noise (m), given or estimated; None where too few rays stopped.
 
-        The variance that the sieve takes from the estimate is added back. Noise below about 0.6 cells cannot be
-        separated from the cells' size: that much is estimated where there is none.
+        The sieve lowers the estimated variance; what it takes is added back. This is computed with the kernel's width
+        for the final estimate, whereas the finest level's kernel was set by the estimate before that level converged.
+        Noise below about 0.6 cells cannot be separated from the cells' size: that much is estimated where there is
+        none.
         """
         if self._fixed_std is not None:
             return self._fixed_std
@@ -192,26 +204,30 @@ class ForwardMapper:
         coarse = self._streaming.fit(self._noise).grid(self.options.calibration)
         cells = coarse_cell_index(coarse.frame, frame)
         ratio = coarse.frame.resolution / frame.resolution
-        assert coarse.evidence is not None
-        return OccupancyGrid(frame, coarse.probability[cells], coarse.evidence[cells] / np.float32(ratio))
+        assert coarse.visits is not None
+        return OccupancyGrid(frame, coarse.probability[cells], coarse.visits[cells] / np.float32(ratio))
 
     def streaming_map(self) -> tuple[Level, RangeNoise] | None:
         """Return the streaming map and the range noise so far; None before there is any."""
         return None if self._streaming is None else (self._streaming.level, self._noise)
 
     def finish(self) -> OccupancyGrid:
-        """Return the map of all scans, fitted until convergence."""
+        """Return the map of all scans, see :meth:`fit`."""
         return self.fit().grid(self.options.calibration)
 
     def fit(self) -> ForwardFit:
-        """Return the fit to all scans, before it is turned into occupancy."""
+        """Return the fit to all scans, before it is turned into occupancy.
+
+        Each level is fitted until convergence, in ``max_passes`` at most, and the finest one then in ``final_passes``
+        at most.
+        """
         with worker_pool(self._threads) as pool:
             level, self._noise = self._fit(pool, self._frame())
-            sums, _ = level.expect(self._rays, self._noise, with_certainty=True)
+            sums, _ = level.expect(self._rays, self._noise, with_arrival=True)
             return fit_of(level, sums, self._noise)
 
     def refit_streaming_map(self) -> None:
-        """Fit the streaming map to all scans so far until convergence, as :meth:`finish` would."""
+        """Fit the streaming map to all scans so far, from coarse to fine as :meth:`fit` does."""
         finest, coarse = self._cells.frame, self._streaming_frame()
         with worker_pool(self._threads) as pool:
             level, self._noise = self._fit(pool, finest, round(coarse.resolution / finest.resolution))
@@ -278,10 +294,11 @@ class ForwardMapper:
         estimates_noise: bool,
         max_passes: int | None = None,
     ) -> RangeNoise:
-        """Iterate on one level until convergence; return the noise.
+        """Iterate on one level until convergence or the largest number of passes; return the noise.
 
-        Steps are over-relaxed. One that lowered the likelihood is undone, and plain steps follow; the last one is
-        plain.
+        Steps are over-relaxed. One that lowered the likelihood is undone, and plain steps follow. The step of the
+        last pass allowed is plain; a level that converges before ends with the step that it took last, of either
+        kind.
         """
         options = self.options
         power, best = options.over_relaxation, -math.inf
@@ -307,7 +324,7 @@ class ForwardMapper:
         return noise
 
     def _held_out_noise(self, level: Level, noise: RangeNoise) -> RangeNoise:
-        """Return the maximum-likelihood noise of the held-out rays, given the map."""
+        """Return the noise after a few steps of expectation-maximisation on the held-out rays, given the map."""
         for _ in range(self.options.hold_out_passes):
             _, statistics = level.expect(self._rays, noise, RaySubset(fold=Fold.HELD_OUT))
             noise = statistics.range_noise(noise, level.frame.resolution, self.options)
@@ -315,7 +332,7 @@ class ForwardMapper:
 
 
 def fit_of(level: Level, sums: NDArray[np.float32], noise: RangeNoise) -> ForwardFit:
-    """Return a level's map with the evidence and certainty of an E step.
+    """Return a level's map with the expected visits and the arrival probabilities of an E step.
 
     Args:
         level: The level.
@@ -325,20 +342,26 @@ def fit_of(level: Level, sums: NDArray[np.float32], noise: RangeNoise) -> Forwar
     Returns:
         The fit.
     """
-    evidence, certainty = evidence_and_certainty(sums)
+    visits, arrival_probability = visits_and_arrival_probability(sums)
     shape = level.frame.shape
-    return ForwardFit(level.frame, level.stopping, evidence.reshape(shape), certainty.reshape(shape), noise)
+    return ForwardFit(level.frame, level.stopping, visits.reshape(shape), arrival_probability.reshape(shape), noise)
 
 
 class StreamingMap:
     """The coarser map while scans stream in, updated by stepwise expectation-maximisation (Cappé and Moulines 2009).
 
-    Each step takes the newest rays and some earlier ones. The E step's sums always stand for all rays so far: the new
-    rays' are added, and the earlier rays' are discounted by the share of them that is revisited.
+    A step takes the m newest rays and r of the n earlier ones, these in turn. The E step's sums per cell stand for
+    all rays so far: they are multiplied by 1 - r / n, and those of the m + r rays under the current map are added.
+    Per ray this is a stepwise update with step size (m + r) / (m + n). The range noise is the geometric mean of its
+    last value and the estimate from these m + r rays alone.
+
+    Cells are at least twice as large as the mapper's. A frame that grows keeps the map while the resolution stays the
+    same; otherwise the map starts anew, with all rays in its first step.
 
     Attributes:
         level: The map.
-        determines_noise: Whether the last step's rays sufficed to estimate the range noise.
+        determines_noise: Whether the new or the earlier rays of the last step sufficed to estimate the range noise;
+            not updated while the noise is given.
     """
 
     def __init__(self, frame: GridFrame, previous: StreamingMap | None, options: ForwardOptions = DEFAULTS) -> None:
@@ -381,12 +404,12 @@ class StreamingMap:
         self.level.smooth(noise.std)
         negligible = np.float32(self._options.negligible_stopping)
         self.level.set_parameters(np.maximum(fitted.parameters, negligible))  # a parameter of 0 would stay 0
-        self._sums, statistics = self.level.expect(rays, noise, with_certainty=True)
+        self._sums, statistics = self.level.expect(rays, noise, with_arrival=True)
         self._done, self._next = len(rays), 0
         self.determines_noise = statistics.determines_noise(self._options)
 
     def step(self, rays: RayStore, noise: RangeNoise, is_noise_fixed: bool) -> RangeNoise:
-        """Take the newest rays and some earlier ones, and compute one M step.
+        """Compute the E step of the newest rays and some earlier ones, and one M step.
 
         Args:
             rays: All rays so far.
@@ -406,7 +429,7 @@ class StreamingMap:
         found = []
         for subset in (old, new):
             if subset.end is not None and subset.end > subset.begin:
-                sums, statistics = level.expect(rays, noise, subset, with_certainty=True)
+                sums, statistics = level.expect(rays, noise, subset, with_arrival=True)
                 self._sums += sums
                 found.append(statistics)
         level.maximize(self._sums)
@@ -470,21 +493,6 @@ def check_size(frame: GridFrame, options: ForwardOptions = DEFAULTS) -> None:
         )
 
 
-def cores() -> int:
-    """Return the number of cores that this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-
-
-@contextmanager
-def worker_pool(threads: int) -> Iterator[ThreadPoolExecutor | None]:
-    """Yield a pool of threads for the time of a context; None where one thread is enough."""
-    if threads == 1:
-        yield None
-        return
-    with ThreadPoolExecutor(threads) as pool:
-        yield pool
-
-
 def coarsened(frame: GridFrame, factor: int) -> GridFrame:
     """Return the frame of larger cells, on whole multiples of their size, that covers another.
 
@@ -515,18 +523,3 @@ def level_factors(noise_cells: float, options: ForwardOptions = DEFAULTS) -> lis
     while factor < options.max_coarsest_factor and options.coarsest_noise_cells * factor < noise_cells:
         factor *= 2
     return [factor >> k for k in range(factor.bit_length())]
-
-
-def neighbour_noise(ranges: NDArray[np.float32]) -> float | None:
-    """Estimate the range noise from the differences of neighbouring beams, by their median absolute deviation.
-
-    Args:
-        ranges: Ranges (N,) in m, in the order of their beams; those that are not finite are left out.
-
-    Returns:
-        The standard deviation (m), an upper bound where ranges vary; None where there are no two beams.
-    """
-    differences = np.diff(ranges[np.isfinite(ranges)])
-    if not len(differences):
-        return None
-    return float(np.median(np.abs(differences))) * 1.4826 / math.sqrt(2)

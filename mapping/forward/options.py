@@ -18,11 +18,11 @@ class ForwardOptions:
     calibration: CalibrationOptions = field(default_factory=CalibrationOptions)
     """How stopping probabilities become probabilities of occupancy."""
 
-    # The sieve: the prior of the map.
+    # The sieve: the restriction to smooth maps.
 
     smoothing: float = 0.3
     """Width of the sieve's Gaussian kernel over sqrt(sigma * resolution). Of 0.2, 0.3 and 0.4 the middle one gave the
-    best maps on recorded sessions (docs/forward.md, «The prior»)."""
+    best maps on recorded sessions (docs/forward.md, «Sieve»)."""
 
     min_smoothing_cells: float = 0.3
     """A kernel that is narrower than this (cells) is a single weight: no smoothing."""
@@ -31,14 +31,14 @@ class ForwardOptions:
     """The kernel ends at this many standard deviations."""
 
     sieve_variance: float = 3.5
-    """The sieve blurs the map, which lowers the estimated noise variance by this times the kernel's own. Measured on
-    seeds 0 to 3 of recorded sessions (docs/forward.md, «The noise»)."""
+    """The sieve smooths the map, which lowers the estimated noise variance by this times the kernel's own. Measured
+    on seeds 0 to 3 of recorded sessions (docs/forward.md, «Range noise»)."""
 
     min_stopping: float = 1e-7
-    """Lower bound of a cell's stopping probability."""
+    """Lower bound of a cell's stopping probability o, and of the parameters p that are not fixed at 0."""
 
     max_stopping: float = 1 - 1e-4
-    """Upper bound of a cell's stopping probability."""
+    """Upper bound of a cell's stopping probability o and parameter p."""
 
     # The range noise.
 
@@ -70,7 +70,7 @@ class ForwardOptions:
     """One in this many rays is held out: the noise is estimated from rays that the map was not fitted to."""
 
     hold_out_passes: int = 3
-    """Number of estimates of the noise from the held-out rays."""
+    """Number of steps of expectation-maximisation that estimate the noise from the held-out rays, the map fixed."""
 
     hold_out_min_rays: int = 1000
     """With fewer rays than this none are held out."""
@@ -81,7 +81,8 @@ class ForwardOptions:
     # Expectation-maximisation from coarse to fine.
 
     initial_stopping: float = 0.02
-    """Stopping probability of every cell before the fit; times the factor on levels of larger cells."""
+    """Parameter p of every cell before the fit, times the coarsest level's factor; on the streaming map it is always
+    twice this, however large its cells are."""
 
     tolerance: float = 5e-4
     """The finest level has converged when a pass raises the mean log-likelihood of a ray by less (nats)."""
@@ -97,7 +98,7 @@ class ForwardOptions:
 
     over_relaxation: int = 3
     """Exponent of the M step's odds ratio (Salakhutdinov and Roweis 2003); 1 is plain expectation-maximisation. A
-    step that lowers the likelihood is undone."""
+    step that lowers the likelihood is undone, and those that follow on the level are plain."""
 
     min_coarsest_factor: int = 4
     """The coarsest level's cells are at least this many times as large as the map's."""
@@ -118,7 +119,8 @@ class ForwardOptions:
     """The other levels then take one in this many rays."""
 
     negligible_stopping: float = 1e-4
-    """Cells with a stopping probability of no more than this on a coarser level are fixed at 0 on finer ones."""
+    """Parameters p that start on a level, from the coarser one's, with no more than this are fixed at 0 there. The
+    stopping probability o of such a cell follows from its neighbours' p, and is no less than ``min_stopping``."""
 
     # While scans stream in: stepwise expectation-maximisation.
 

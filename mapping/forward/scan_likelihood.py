@@ -1,8 +1,9 @@
 """The forward sensor model as a likelihood of poses: how well a scan fits a map, and the pose where it fits best.
 
 log p(scan | pose, map) is the sum of the rays' log-densities under the model of :mod:`mapping.forward.likelihood`.
-Its score (gradient) is found by central differences, its information by the outer product of single rays' scores
-(Berndt, Hall, Hall and Hausman 1974), and its maximum by Gauss-Newton steps.
+Its gradient g is taken by central differences, and the information matrix from the outer products of the n single
+rays' gradients (Berndt, Hall, Hall and Hausman 1974), centred: g g^T / n is subtracted from their sum. The maximum is
+found by scoring steps with this matrix.
 """
 
 from __future__ import annotations
@@ -33,14 +34,15 @@ class ScanLikelihoodOptions:
     difference_noise: float = 0.2
     """Half-width of the central differences as a share of the noise's standard deviation."""
 
-    lever_arm: float = 1.0
-    """The difference of heading displaces what is this far away (m) as far as the differences of position do."""
+    rotation_scale: float = 1.0
+    """Length scale of rotations (m): the difference of heading displaces what is this far away as far as the
+    differences of position do."""
 
     min_noise_cells: float = 0.5
     """The noise counts as this many cells at least: where in a cell a surface lies is unknown."""
 
     max_steps: int = 4
-    """Largest number of Gauss-Newton steps."""
+    """Largest number of scoring steps."""
 
     max_extension: int = 8
     """A step is lengthened up to this many times, while the posterior rises."""
@@ -101,18 +103,18 @@ class ScanRays:
 
 
 @dataclass(frozen=True)
-class PoseScore:
+class PoseDerivatives:
     """The likelihood of a pose and its derivatives.
 
     Attributes:
         log_likelihood: Log-likelihood of the scan (nats).
-        score: Gradient of the log-likelihood (3,) with respect to x, y (m), heading (rad).
-        information: Information about the pose (3, 3).
+        gradient: Gradient of the log-likelihood (3,) with respect to x, y (m), heading (rad).
+        information: Estimate of the Fisher information about the pose (3, 3), by the centred outer products.
         rays: Number of rays that cross the map.
     """
 
     log_likelihood: float
-    score: FloatArray
+    gradient: FloatArray
     information: FloatArray
     rays: int
 
@@ -152,8 +154,10 @@ class ScanLikelihood:
         std = max(noise.std, options.min_noise_cells * level.frame.resolution)
         return cls(level.frame, level.stopping, RangeNoise(std, noise.outlier_share), options=options)
 
-    def score(self, scan: ScanRays, pose: FloatArray, mount: FloatArray, noise_scale: float = 1.0) -> PoseScore:
-        """Compute the log-likelihood of a pose, its score and its information.
+    def derivatives(
+        self, scan: ScanRays, pose: FloatArray, mount: FloatArray, noise_scale: float = 1.0
+    ) -> PoseDerivatives:
+        """Compute the log-likelihood of a pose, its gradient and its information.
 
         Args:
             scan: The scan.
@@ -166,7 +170,7 @@ class ScanLikelihood:
         """
         std, options = self.noise.std * noise_scale, self.options
         step = max(options.difference_cells * self.frame.resolution, options.difference_noise * std)
-        return self._evaluate(scan, pose, mount, std, np.array([step, step, step / options.lever_arm]))
+        return self._evaluate(scan, pose, mount, std, np.array([step, step, step / options.rotation_scale]))
 
     def log_likelihood(self, scan: ScanRays, pose: FloatArray, mount: FloatArray, noise_scale: float = 1.0) -> float:
         """Compute the log-likelihood of a pose alone.
@@ -184,14 +188,14 @@ class ScanLikelihood:
 
     def _evaluate(
         self, scan: ScanRays, pose: FloatArray, mount: FloatArray, std: float, steps: FloatArray
-    ) -> PoseScore:
+    ) -> PoseDerivatives:
         result = np.empty(11)
         sensor = sensor_fields(RangeNoise(std, self.noise.outlier_share), self.ray_model)
         geometry, placement = geometry_fields(self.frame), (pose, mount, steps)
         pose_likelihood(scan.rays, scan.limits, placement, geometry, self.stopping, sensor, result)
-        score, rays = result[1:4], int(result[10])
-        information = result[[4, 5, 6, 5, 7, 8, 6, 8, 9]].reshape(3, 3) - np.outer(score, score) / max(rays, 1)
-        return PoseScore(float(result[0]), score, information, rays)
+        gradient, rays = result[1:4], int(result[10])
+        information = result[[4, 5, 6, 5, 7, 8, 6, 8, 9]].reshape(3, 3) - np.outer(gradient, gradient) / max(rays, 1)
+        return PoseDerivatives(float(result[0]), gradient, information, rays)
 
 
 def maximize_pose(
@@ -202,11 +206,11 @@ def maximize_pose(
     prior: FloatArray,
     prior_information: FloatArray,
     noise_scale: float = 1.0,
-) -> tuple[FloatArray, PoseScore]:
-    """Maximise the posterior of a pose by a few Gauss-Newton steps.
+) -> tuple[FloatArray, PoseDerivatives]:
+    """Maximise the posterior of a pose by a few scoring steps (Berndt, Hall, Hall and Hausman 1974).
 
-    Far from the maximum the outer product of scores overestimates the information: a step is lengthened while the
-    posterior rises, and halved until it does.
+    Far from the maximum the outer products overestimate the information: a step is lengthened while the posterior
+    rises, and halved until it does.
 
     Args:
         likelihood: The likelihood under a map.
@@ -228,10 +232,10 @@ def maximize_pose(
     def after(step: FloatArray) -> float:
         return log_posterior(pose + step, likelihood.log_likelihood(scan, pose + step, mount, noise_scale))
 
-    current = likelihood.score(scan, pose, mount, noise_scale)
+    current = likelihood.derivatives(scan, pose, mount, noise_scale)
     for _ in range(options.max_steps):
         height = log_posterior(pose, current.log_likelihood)
-        gradient = current.score - prior_information @ (pose - prior)
+        gradient = current.gradient - prior_information @ (pose - prior)
         step: FloatArray = np.linalg.solve(current.information + prior_information, gradient).astype(float)
         reached, length = after(step), 1
         while reached > height and length < options.max_extension and (further := after(2 * step)) > reached:
@@ -242,7 +246,7 @@ def maximize_pose(
         if reached <= height or is_negligible(step, options):
             break
         pose = pose + step
-        current = likelihood.score(scan, pose, mount, noise_scale)
+        current = likelihood.derivatives(scan, pose, mount, noise_scale)
     return pose, current
 
 

@@ -1,16 +1,18 @@
-"""The sieve: the forward map's prior, and the M step under it.
+"""The sieve: the restriction of the forward map to smooth fields, and the M step under it.
 
 The stopping probabilities are a smoothed field, o = K p: each o_c is the weighted mean of its neighbours' parameters
 p, with Gaussian weights K that sum to 1. Restricting the maximum-likelihood estimate to such fields is Grenander's
-method of sieves (Geman and Hwang 1982). Neighbouring cells agree because they share parameters.
+method of sieves (Geman and Hwang 1982): the parameter space is smaller, there is no prior distribution over it.
+Neighbouring cells agree because they share parameters.
 
-The M step stays exact. A ray that enters cell c draws a neighbour d with probability K_cd and stops with probability
-p_d; with d as a latent variable, the expected hits h_c and passes g_c of the E step give
+The M step has a closed form. A ray that enters cell c draws a neighbour d with probability K_cd and stops with
+probability p_d; with d as a latent variable, the expected hits h_c and passes g_c of the E step give
 
     p_d / (1 - p_d)  <-  p_d / (1 - p_d) * [K^T (h / o)]_d / [K^T (g / (1 - o))]_d,
 
-and the likelihood does not fall. Raising the ratio to a power above 1 is over-relaxation (Salakhutdinov and Roweis
-2003).
+which does not lower the likelihood as long as neither p nor o is clipped to its bounds. Raising the ratio to a power
+above 1 is over-relaxation (Salakhutdinov and Roweis 2003), which may lower it: :mod:`mapping.forward.mapper` undoes
+such steps.
 
 Numba's cache watches only this file: constants that the kernels use must stand here, model parameters are arguments.
 """
@@ -47,7 +49,7 @@ def gaussian_kernel(width: float, min_width: float = 0.3, truncation: float = 2.
 
 
 @inline
-def blur_rows(source: Any, target: Any, weights: Any, index: int) -> None:
+def convolve_row(source: Any, target: Any, weights: Any, index: int) -> None:
     """Compute one row of the vertical convolution.
 
     Args:
@@ -68,7 +70,7 @@ def blur_rows(source: Any, target: Any, weights: Any, index: int) -> None:
 
 
 @kernel
-def blur(source: Any, weights: Any, scratch: Any, target: Any) -> None:
+def convolve(source: Any, weights: Any, scratch: Any, target: Any) -> None:
     """Convolve an array with a kernel along both axes; what lies outside is 0.
 
     Args:
@@ -89,7 +91,7 @@ def blur(source: Any, weights: Any, scratch: Any, target: Any) -> None:
             for j in range(k, cols):
                 scratch[i, j] += w * source[i, j - k]
     for i in range(rows):
-        blur_rows(scratch, target, weights, i)
+        convolve_row(scratch, target, weights, i)
 
 
 @kernel
@@ -114,15 +116,17 @@ def kernel_sums(count: int, weights: Any) -> Any:
 
 @kernel
 def reduce_blocks(sums: Any, stopping: Any, row_sums: Any, col_sums: Any, hits: Any, passes: Any) -> None:
-    """Add up the blocks' expected counts, always in the same order, and divide them by the model.
+    """Add up the blocks' expected counts, always in the same order; compute what the M step convolves with K^T.
+
+    With h the expected hits and g the expected passes this is h / o and g / (1 - o), over the kernel's sums.
 
     Args:
         sums: Expected hits and passes (blocks, rows * cols, 2 or 3) of the E step.
         stopping: Stopping probabilities o (rows, cols).
         row_sums: The kernel's sums (rows,), see :func:`kernel_sums`.
         col_sums: The kernel's sums (cols,).
-        hits: Filled (rows, cols) with hits / o over the kernel's sums.
-        passes: Filled (rows, cols) with passes / (1 - o) over the kernel's sums.
+        hits: Filled (rows, cols) with h / o over the kernel's sums.
+        passes: Filled (rows, cols) with g / (1 - o) over the kernel's sums.
     """
     rows, cols = stopping.shape
     for i in range(rows):
@@ -145,8 +149,8 @@ def maximize(parameters: Any, active: Any, hits: Any, passes: Any, power: int, b
     Args:
         parameters: The parameters p (rows, cols).
         active: Which of them change (rows, cols).
-        hits: K^T (hits / o) (rows, cols).
-        passes: K^T (passes / (1 - o)) (rows, cols).
+        hits: K^T (h / o) (rows, cols), h the expected hits.
+        passes: K^T (g / (1 - o)) (rows, cols), g the expected passes.
         power: How often the odds are multiplied by the ratio of the two: 1 is expectation-maximisation, more is
             over-relaxed.
         bounds: The parameters' lower and upper bound, float32.
@@ -168,16 +172,16 @@ def maximize(parameters: Any, active: Any, hits: Any, passes: Any, power: int, b
 
 
 @kernel
-def normalize(blurred: Any, row_sums: Any, col_sums: Any, bounds: Any) -> None:
-    """Divide a blurred array by the kernel's sums, in place, and clip it.
+def normalize(convolved: Any, row_sums: Any, col_sums: Any, bounds: Any) -> None:
+    """Divide a convolved array by the kernel's sums, in place, and clip it.
 
     Args:
-        blurred: (rows, cols).
+        convolved: (rows, cols).
         row_sums: The kernel's sums (rows,), see :func:`kernel_sums`.
         col_sums: The kernel's sums (cols,).
         bounds: Lower and upper bound, float32.
     """
-    for i in range(blurred.shape[0]):
-        for j in range(blurred.shape[1]):
-            value = blurred[i, j] / (row_sums[i] * col_sums[j])
-            blurred[i, j] = min(max(value, bounds[0]), bounds[1])
+    for i in range(convolved.shape[0]):
+        for j in range(convolved.shape[1]):
+            value = convolved[i, j] / (row_sums[i] * col_sums[j])
+            convolved[i, j] = min(max(value, bounds[0]), bounds[1])

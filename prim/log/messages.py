@@ -63,7 +63,7 @@ class StampedPose(NamedTuple):
         frame_id: The frame that the pose is given in.
         child_frame_id: The frame whose pose it is; empty where the message does not say.
         translation: x, y, z (m).
-        rotation: Unit quaternion x, y, z, w.
+        rotation: Quaternion x, y, z, w as the message holds it: of unit norm only if it is there.
     """
 
     stamp: int
@@ -308,7 +308,7 @@ def decode_poses(type_name: str, data: bytes) -> list[StampedPose]:
 
 
 def planar_pose(pose: StampedPose) -> Pose2D:
-    """Project a pose onto the x-y plane: x, y and the heading of the x axis."""
+    """Project a pose, whose quaternion has unit norm, onto the x-y plane: x, y and the heading of the x axis."""
     x, y, z, w = pose.rotation
     heading = math.atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
     return Pose2D(pose.translation[0], pose.translation[1], heading)

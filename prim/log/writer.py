@@ -28,6 +28,7 @@ class LogWriter:
 
     Raises:
         OutputError: The log cannot be written.
+        InterruptedRecordingError: A KeyboardInterrupt ended the ``with`` block; the part until then is in ``.part``.
     """
 
     def __init__(self, path: Path) -> None:

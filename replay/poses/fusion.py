@@ -62,10 +62,10 @@ class PoseEstimate:
     gains: FloatArray | None = None
 
     def frame_covariance(self, stamps: Stamps) -> FloatArray:
-        """Compute the uncertainty of the place of a map that is made from the poses at ``stamps`` (ns).
+        """Compute the covariance (3, 3) of the pose of the map frame that the poses at ``stamps`` (ns) define.
 
-        Returns the covariance (3, 3) of the map frame's x, y (m) and heading (rad) at its origin. Raises ValueError
-        for poses that are not smoothed.
+        The mean error of these poses moves a map made from them as a whole. The covariance is that of the frame's
+        x, y (m) and heading (rad), at its origin. Raises ValueError for poses that are not smoothed.
         """
         if self.gains is None:
             raise ValueError("the errors of poses that are not smoothed have no known correlation")
@@ -102,7 +102,11 @@ class Fusion:
 
     @property
     def noise(self) -> SensorNoise:
-        """The noise as given or estimated; None where it is neither."""
+        """The noise in use: given, else estimated, else initial values (see FusionOptions).
+
+        None for the GPS or the compass where no node has a reading of it; and for the odometry's translation
+        (rotation) where it is not given and there are no fixes (neither fixes nor headings) to estimate it from.
+        """
         fixes, headings, translation, rotation, bias = self._noise.tolist()
         has_fixes, has_headings = bool(self.nodes.has_fix.any()), bool(self.nodes.has_heading.any())
         given = self._given
@@ -116,13 +120,13 @@ class Fusion:
 
     @property
     def initial_state(self) -> FilterState:
-        """What is believed before anything is measured; a copy."""
+        """The belief before the first measurement; a copy."""
         return FilterState(self._initial.pose.copy(), self._initial.covariance.copy())
 
     def step_variances(self, nodes: FusionNodes) -> FloatArray:
         """Return the process noise (N, 3) of each node's step: variances along x, y (m^2) and of the heading."""
         std = self._noise[[TRANSLATION_STD, TRANSLATION_STD, ROTATION_STD]]
-        return nodes.distances[:, None] * std**2 + self._options.min_step_variance
+        return nodes.variance_scales[:, None] * std**2 + self._options.min_step_variance
 
     def filtered(self) -> PoseEstimate:
         """Estimate each pose from the measurements until then."""
@@ -185,10 +189,10 @@ class Fusion:
         options = self._options
         if scans is None:
             scans = QuadraticTerms(np.zeros((0, 3)), np.zeros((0, 6)), np.zeros((0, 3)))
-        measurements = Measurements(nodes.steps, nodes.distances, nodes.fixes, nodes.headings, scans)
+        measurements = Measurements(nodes.steps, nodes.variance_scales, nodes.fixes, nodes.headings, scans)
         # without odometry a turn cannot be distinguished from a wrong heading, and nothing is rejected
         thresholds = (options.fix_gate, options.heading_gate) if nodes.has_odometry else (math.inf, math.inf)
-        fix_gate, heading_gate = (Gate(threshold, options.reset_after) for threshold in thresholds)
+        fix_gate, heading_gate = (Gate(threshold, options.max_rejections) for threshold in thresholds)
         model = FilterModel(noise, nodes.lever_arm, fix_gate, heading_gate, options.min_step_variance)
         output = FilterOutput.empty(len(nodes.stamps))
         run_filter(initial or self._initial, measurements, model, output)

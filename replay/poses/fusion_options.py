@@ -16,9 +16,10 @@ class SensorNoise:
     Attributes:
         position_std: Of position fixes, along each axis (m).
         heading_std: Of compass headings (rad).
-        odometry_translation_std: Of the odometry's position after one metre, along each axis (m). Without odometry:
-            of a random walk after one second.
-        odometry_rotation_std: Of the odometry's heading after one metre (rad). Without odometry: after one second.
+        odometry_translation_std: Of the odometry's position after one metre straight on, along each axis (m). Without
+            odometry: of a random walk after one second.
+        odometry_rotation_std: Of the odometry's heading after one metre straight on (rad). Without odometry: of a
+            random walk after one second.
         heading_bias: The constant offset of all compass headings (rad).
     """
 
@@ -98,19 +99,20 @@ class FusionOptions:
     heading_gate: float = 10.8
     """Squared normalised innovation beyond which a heading is rejected: 1 in 1000 (chi squared, one degree)."""
 
-    reset_after: int = 20
-    """After so many rejections in a row the robot is taken to have been moved; set by hand."""
+    max_rejections: int = 20
+    """After so many rejections in a row the robot is taken to have been moved: the covariance is inflated, and the
+    next measurement used; set by hand."""
 
     min_step_variance: float = 1e-10
     """Process noise of each step at least (m^2, rad^2), so that covariances stay invertible; set by hand."""
 
     rotation_distance: float = 0.03
-    """The distance (m) that a turn by one radian counts as in the odometry's noise: about half the axle of the
+    """The distance (m) that a turn by one radian counts as in the odometry's variances: about half the axle of the
     recorder's robot (0.053 m); set by hand."""
 
     idle_distance: float = 4e-4
-    """The distance (m) that a second counts as, moving or not: with the default noise, 1 mm of standard deviation
-    after one second; set by hand."""
+    """The distance (m) that a second counts as in the odometry's variances, moving or not: with the default noise,
+    1 mm of standard deviation after one second; set by hand."""
 
     default_odometry_std: tuple[float, float] = (0.05, math.radians(2))
     """The odometry's noise after one metre (m, rad) where a log does not determine it: the recorder's default."""

@@ -2,9 +2,9 @@
 
 The state is the robot's x, y (m) and heading (rad, not wrapped) in the map frame. Time is cut into nodes; from one to
 the next the robot moves by a step that is measured in its own frame (Thrun, Burgard and Fox, Probabilistic
-Robotics, 2005, chapter 5: odometry as control), whose variances grow with the distance travelled. At a node there may
-be a position fix, a heading, and a scan's log-likelihood of the pose. Covariances are stored as the six numbers xx,
-xy, xt, yy, yt, tt of their upper triangles.
+Robotics, 2005, chapter 5: odometry as control), whose variances grow with distance, turns and time (see
+:class:`Measurements`). At a node there may be a position fix, a heading, and a scan's log-likelihood of the pose.
+Covariances are stored as the six numbers xx, xy, xt, yy, yt, tt of their upper triangles.
 
 filterpy's filter does the same at some 70 to 150 microseconds a node; these take below one (bench/poses.py), which
 makes it affordable to estimate the noise by filtering a log some fifty times. The tests compare them with filterpy.
@@ -22,19 +22,20 @@ from prim.arrays import FloatArray
 from prim.compiled import inline, kernel
 
 FIX_STD, HEADING_STD, TRANSLATION_STD, ROTATION_STD, HEADING_BIAS = range(5)
-"""Indices into the noise parameters (5,): standard deviations of fixes (m) and headings (rad), of the odometry's
-translation (m) and rotation (rad) after one metre, and the constant offset of all headings (rad)."""
+"""Indices into the noise parameters (5,): standard deviations of fixes (m) and headings (rad); those of a step's
+translation (m, along each axis) and rotation (rad) where its variance scale is 1, that is after one metre straight on
+or, without odometry, after one second; and the constant offset of all headings (rad)."""
 
 USED, REJECTED = 1, 2
 """The gate's decision on a measurement; 0 where there is none."""
 
 
 class FilterState(NamedTuple):
-    """A Gaussian belief about the robot's pose, which the kernels update in place.
+    """A Gaussian belief about the robot's pose.
 
     Attributes:
-        pose: (3,) x, y (m), heading (rad).
-        covariance: (6,).
+        pose: The mean (3,): x, y (m), heading (rad, not wrapped).
+        covariance: Its covariance, the six numbers (6,) of the upper triangle.
     """
 
     pose: FloatArray
@@ -42,17 +43,19 @@ class FilterState(NamedTuple):
 
 
 class QuadraticTerms(NamedTuple):
-    """Second-order expansions of the scans' log-likelihoods, one a node; zeros where a node has no scan.
+    """Quadratic approximations of the scans' log-likelihoods, one a node; zeros where a node has no scan.
 
-    The log-likelihood of a pose that differs from the center by d is, up to a constant, s . d - d' I d / 2.
+    The log-likelihood of a pose that differs from the center by d is, up to a constant, g . d - d' I d / 2. I is not
+    the negative Hessian, but the information estimated by the outer products of single rays' scores (Berndt, Hall,
+    Hall and Hausman, 1974; see mapping.forward.scan_likelihood).
 
     Attributes:
-        scores: The gradients s (N, 3).
-        information: The matrices I (N, 6).
-        centers: The poses (N, 3) that the expansions are made at.
+        gradients: The gradients g (N, 3).
+        information: The information matrices I (N, 6).
+        centers: The poses (N, 3) that the approximations are made at.
     """
 
-    scores: FloatArray
+    gradients: FloatArray
     information: FloatArray
     centers: FloatArray
 
@@ -62,14 +65,16 @@ class Measurements(NamedTuple):
 
     Attributes:
         steps: Motions (N, 3) since the node before (or the initial state), in the robot's own frame there.
-        distances: How far the robot travelled in each step (N,) in m, which scales the process noise.
+        variance_scales: The variances (N,) of each step's process noise, in units of the squared standard deviations
+            at TRANSLATION_STD and ROTATION_STD. With odometry a length in m, in which turns and time count as
+            distance; without odometry the time in s (see FusionNodes).
         fixes: Positions of the antenna (N, 2) in m; NaN where there is none.
         headings: Compass headings (N,) in rad; NaN where there is none.
         scans: The scans' log-likelihoods; of N nodes, or of none at all.
     """
 
     steps: FloatArray
-    distances: FloatArray
+    variance_scales: FloatArray
     fixes: FloatArray
     headings: FloatArray
     scans: QuadraticTerms
@@ -80,11 +85,13 @@ class Gate(NamedTuple):
 
     Attributes:
         threshold: A measurement with a larger squared normalised innovation is rejected.
-        reset_after: After so many rejections in a row the state is reset to the measurement.
+        max_rejections: After so many rejections in a row the next measurement is used even if it fails the test. The
+            covariance is inflated by the squared innovation first, along the axes that are measured, so that the
+            estimate moves most of the way to the measurement.
     """
 
     threshold: float
-    reset_after: int
+    max_rejections: int
 
 
 class FilterModel(NamedTuple):
@@ -95,7 +102,7 @@ class FilterModel(NamedTuple):
         lever_arm: The antenna's position on the robot (2,) in m.
         fix_gate: Of position fixes.
         heading_gate: Of headings.
-        min_step_variance: Added to the process noise of each step (m^2, rad^2).
+        min_step_variance: Added to the variances of each step's process noise (m^2, rad^2).
     """
 
     noise: FloatArray
@@ -139,7 +146,7 @@ class FilterOutput(NamedTuple):
 
 @inline
 def _wrap(angle: float) -> float:
-    """Return the angle (rad) in [-pi, pi)."""
+    """Return the angle (rad) in [-pi, pi): kernels cannot call prim.se2.wrap_angle, which is not compiled."""
     return angle - 2 * math.pi * math.floor((angle + math.pi) / (2 * math.pi))
 
 
@@ -187,13 +194,13 @@ def _predict(pose: Any, cov: Any, step: Any, position_variance: float, heading_v
 
 
 @inline
-def _update_with_scan(pose: Any, cov: Any, score: Any, information: Any, center: Any, work: Any) -> None:
+def _update_with_scan(pose: Any, cov: Any, gradient: Any, information: Any, center: Any, work: Any) -> None:
     """Update the state with one row of QuadraticTerms, in information form."""
     dx, dy, dt = pose[0] - center[0], pose[1] - center[1], _wrap(pose[2] - center[2])
     i = information
-    gx = score[0] - i[0] * dx - i[1] * dy - i[2] * dt
-    gy = score[1] - i[1] * dx - i[3] * dy - i[4] * dt
-    gt = score[2] - i[2] * dx - i[4] * dy - i[5] * dt
+    gx = gradient[0] - i[0] * dx - i[1] * dy - i[2] * dt
+    gy = gradient[1] - i[1] * dx - i[3] * dy - i[4] * dt
+    gt = gradient[2] - i[2] * dx - i[4] * dy - i[5] * dt
     _invert(cov, work)
     for k in range(6):
         work[k] += i[k]
@@ -210,8 +217,9 @@ def _update_with_fix(
     """Update the state with a position fix of the antenna at the lever arm.
 
     Returns its cost (minus twice the log-likelihood, up to a constant; capped at the gate where it is rejected) and
-    the number of rejections in a row. A reset is a motion that nobody measured: ``predicted``, the predicted
-    covariance (6,), is enlarged by it as well, so that the smoother does not spread the jump over earlier steps.
+    the number of rejections in a row. After ``gate.max_rejections`` of them the robot is taken to have been moved by
+    the innovation, unmeasured: that inflates ``predicted``, the predicted covariance (6,), as well, so that the
+    smoother does not spread the jump over earlier steps.
     """
     x, y = fix[0], fix[1]
     cos, sin = math.cos(pose[2]), math.sin(pose[2])
@@ -224,7 +232,7 @@ def _update_with_fix(
     squared = (yy * nx * nx - 2 * xy * nx * ny + xx * ny * ny) / determinant
     size = math.log(determinant)
     if squared > gate.threshold:
-        if rejections < gate.reset_after:
+        if rejections < gate.max_rejections:
             return gate.threshold + size, rejections + 1
         cov[0] += nx * nx
         cov[3] += ny * ny
@@ -246,7 +254,7 @@ def _update_with_heading(
     squared = innovation * innovation / spread
     size = math.log(spread)
     if squared > gate.threshold:
-        if rejections < gate.reset_after:
+        if rejections < gate.max_rejections:
             return gate.threshold + size, rejections + 1
         cov[5] += innovation * innovation
         predicted[5] += innovation * innovation
@@ -259,16 +267,21 @@ def run_filter(initial: FilterState, measurements: Measurements, model: FilterMo
     """Run the extended Kalman filter over N nodes.
 
     Args:
-        initial: The belief before the first node; left unchanged.
+        initial: The belief before the first step; copied, and left unchanged.
         measurements: What is measured at the nodes.
         model: The parameters of the filter.
         output: Filled; arrays of N rows.
     """
     # unpacked once: each access to a tuple's array costs an atomic reference count
-    steps, distances, noise, lever = measurements.steps, measurements.distances, model.noise, model.lever_arm
+    steps, variance_scales, noise, lever = (
+        measurements.steps,
+        measurements.variance_scales,
+        model.noise,
+        model.lever_arm,
+    )
     fixes, headings = measurements.fixes, measurements.headings
-    scores, information, centers = (
-        measurements.scans.scores,
+    gradients, information, centers = (
+        measurements.scans.gradients,
         measurements.scans.information,
         measurements.scans.centers,
     )
@@ -279,8 +292,8 @@ def run_filter(initial: FilterState, measurements: Measurements, model: FilterMo
     fix_gate, heading_gate, min_variance = model.fix_gate, model.heading_gate, model.min_step_variance
     fix_rejections = heading_rejections = 0
     for k in range(len(steps)):
-        translation_variance = distances[k] * noise[TRANSLATION_STD] ** 2 + min_variance
-        rotation_variance = distances[k] * noise[ROTATION_STD] ** 2 + min_variance
+        translation_variance = variance_scales[k] * noise[TRANSLATION_STD] ** 2 + min_variance
+        rotation_variance = variance_scales[k] * noise[ROTATION_STD] ** 2 + min_variance
         _predict(pose, cov, steps[k], translation_variance, rotation_variance)
         predicted_poses[k], predicted_covariances[k] = pose, cov
         predicted = predicted_covariances[k]
@@ -299,8 +312,8 @@ def run_filter(initial: FilterState, measurements: Measurements, model: FilterMo
             )
             costs[k] += cost
             decisions[k, 1] = REJECTED if heading_rejections else USED
-        if len(scores):
-            _update_with_scan(pose, cov, scores[k], information[k], centers[k], work)
+        if len(gradients):
+            _update_with_scan(pose, cov, gradients[k], information[k], centers[k], work)
         poses[k], covariances[k] = pose, cov
 
 

@@ -47,7 +47,10 @@ class SensorMounts:
             return TransformTree()
 
     def fixed_chain(self, frame: str) -> list[str]:
-        """Return the tf chain from ``frame`` to ``map``, else ``odom``, else a moving root; else the frame alone."""
+        """Return the tf chain from ``frame`` up to ``map``, else up to ``odom``, else up to the root of the tree.
+
+        The last only where a transform on the way changes over time; where all are static, the frame alone.
+        """
         chain = self.tree.chain(frame)
         for root in FIXED_FRAMES:
             if root in chain:

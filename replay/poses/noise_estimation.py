@@ -61,10 +61,13 @@ class NoiseEstimator:
         return noise
 
     def is_significant(self, noise: FloatArray, parameter: int) -> bool:
-        """Test by its score whether a parameter differs from its value in ``noise`` (Rao, 1948).
+        """Test by its score whether a parameter differs from its value in ``noise`` (after Rao, 1948).
+
+        The other parameters are held fixed: their scores are not projected out of this one's, which would change the
+        statistic where they are correlated.
 
         Args:
-            noise: The parameters (5,), the others at their maximum.
+            noise: The parameters (5,), the free ones at the maximum of their posterior.
             parameter: The index of the one to be tested.
 
         Returns:
@@ -74,6 +77,7 @@ class NoiseEstimator:
         return bool(scores.sum() ** 2 > self._options.score_threshold * (scores**2).sum())
 
     def _scoring_step(self, noise: FloatArray, initial: FloatArray, free: Sequence[int]) -> FloatArray:
+        """Return a scoring step on the log-posterior (len(free),), limited in size."""
         options = self._options
         scores = self._node_scores(noise, free)
         prior_score = -_log_ratios(noise, initial, free) / options.prior_log_std**2

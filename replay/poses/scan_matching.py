@@ -1,9 +1,12 @@
 """Poses corrected by the map: each scan is matched with a forward map of the scans, and all poses are smoothed anew.
 
-Poses that drift are first corrected scan by scan, as the map grows: a few Gauss-Newton steps each, from where the
-odometry predicts. Then in rounds: a map of all scans, each scan's log-likelihood of its pose in it, and a smoother
-over all poses, odometry, fixes and headings. The log-likelihood is that of the scan's rays under the forward sensor
-model.
+Poses that drift are first corrected scan by scan, as the map grows: a few scoring steps each, from where the
+odometry predicts. Then in rounds: a map of all scans, each scan's log-likelihood of its pose in it (the map contains
+the scan itself), and a smoother over all poses, odometry, fixes and headings. The log-likelihood is that of the
+scan's rays under the forward sensor model.
+
+Where a pose's uncertainty is needed as one length, its heading counts at a lever arm of 1 m: the length is the square
+root of var x + var y + (1 m)^2 var theta.
 """
 
 from __future__ import annotations
@@ -51,21 +54,23 @@ class ScanMatchingOptions:
     """The growing map has cells of twice the resolution, or larger ones where it would have more cells than this."""
 
     max_rounds: int = 12
-    """At most so many maps are made of all scans."""
+    """At most so many maps are made of all scans once they are complete. Those that are made while scans are added
+    (see ``first_rematch``), one each time, are extra."""
 
-    trust_position_std: float = 0.1
-    """How far a scan may move its pose in one round (m): standard deviation of a prior in place of the other
-    sensors."""
+    damping_position_std: float = 0.1
+    """Standard deviation (m) of the Gaussian prior around the current position in one round, which damps the steps of
+    the maximisation. It is no bound, and no part of the information that enters the smoother."""
 
-    trust_heading_std: float = math.radians(2)
-    """How far a scan may turn its pose in one round (rad), likewise."""
+    damping_heading_std: float = math.radians(2)
+    """Standard deviation (rad) of that prior around the current heading."""
 
-    max_widening: float = 8.0
-    """Coarse to fine: the range noise is multiplied by at most this factor."""
+    max_noise_scale: float = 8.0
+    """Annealing, from coarse to fine: the range noise is first multiplied by a factor of at most this, which is then
+    halved again and again, down to 1."""
 
-    widening_deviations: float = 2.5
-    """The range noise is widened to so many standard deviations of the pose, so that the scan can be matched from
-    there."""
+    annealing_deviations: float = 2.5
+    """The range noise is first enlarged to so many standard deviations of the pose, so that the scan can be matched
+    from there."""
 
     first_rematch: int = 4
     """All scans so far are matched anew when they are so many, and each time that their number has doubled."""
@@ -74,22 +79,22 @@ class ScanMatchingOptions:
     """The rounds end when one raises the mean log-likelihood of a ray by less (nats)."""
 
     inflation_rate: float = 0.3
-    """Exponent by which the odometry's variances follow each scan's normalised correction."""
+    """The odometry's variances are multiplied by this power of each scan's normalised correction."""
 
     max_inflation: float = 1e4
     """The odometry's variances are multiplied by at most this factor."""
 
     free_step_factor: float = 10.0
-    """Steps between poses that do not drift have so many times the standard deviation of the poses: next to no
-    information."""
+    """The steps between poses that do not drift enter as those of an odometry that has so many times the poses'
+    standard deviations: little information."""
 
     min_rays: int = 10
     """Scans with fewer rays on the map are not matched."""
 
     @property
-    def trust_information(self) -> FloatArray:
-        """The information (3, 3) of the prior on a pose in one round."""
-        return np.diag([self.trust_position_std**-2, self.trust_position_std**-2, self.trust_heading_std**-2])
+    def damping_information(self) -> FloatArray:
+        """The information (3, 3) of the prior that damps the change of a pose in one round."""
+        return np.diag([self.damping_position_std**-2, self.damping_position_std**-2, self.damping_heading_std**-2])
 
 
 DEFAULTS = ScanMatchingOptions()
@@ -125,7 +130,11 @@ def match_scans(
 
 
 class ScanMatcher:
-    """The state of :func:`match_scans`, which has the arguments: poses of the robot at the nodes of a fusion."""
+    """The implementation and state of :func:`match_scans`, and with its arguments.
+
+    The state is a pose at each node of a fusion: the robot's where the given poses were fused; else the laser's own,
+    and the mounts are zero.
+    """
 
     def __init__(
         self,
@@ -144,9 +153,9 @@ class ScanMatcher:
         self._drifts = not self._fusion.nodes.has_fix.any()
         self._mounts = np.zeros_like(poses.poses) if poses.mounts is None or not poses.fusion else poses.mounts
         nodes = self._fusion.nodes.stamps
-        self._node = np.searchsorted(nodes, np.clip(stamps, nodes[0], nodes[-1]))
+        self._node_of_scan = np.searchsorted(nodes, np.clip(stamps, nodes[0], nodes[-1]))
         estimate = self._fusion.smoothed()
-        self._robot, self._covariances = estimate.poses, pack_symmetric(estimate.covariances)
+        self._node_poses, self._covariances = estimate.poses, pack_symmetric(estimate.covariances)
         self._rays: dict[int, ScanRays] = {}
         self._scans: list[PosedScan] = []
         self._inflation = 1.0
@@ -160,8 +169,9 @@ class ScanMatcher:
         else:
             for posed in self._source(self._poses):
                 self._add(posed)
+            # m^2: the variance of the heading at a lever arm of 1 m
             variance = float(self._covariances[:, [0, 3, 5]].sum(axis=1).mean())
-            self._match_in_rounds(rounds, self._options.widening_deviations * math.sqrt(variance))
+            self._match_in_rounds(rounds, self._options.annealing_deviations * math.sqrt(variance))
         return self._corrected()
 
     def _match_incrementally(self) -> None:
@@ -169,8 +179,8 @@ class ScanMatcher:
         mapper = self._new_mapper()
         state = self._fusion.initial_state
         last, due = -1, self._options.first_rematch
-        for posed in sorted(self._source(self._poses), key=lambda posed: int(self._node[posed.position])):
-            node, mount = int(self._node[posed.position]), self._mounts[posed.position]
+        for posed in sorted(self._source(self._poses), key=lambda posed: int(self._node_of_scan[posed.position])):
+            node, mount = int(self._node_of_scan[posed.position]), self._mounts[posed.position]
             if node > last:
                 state = self._fusion.advance(last + 1, node + 1, state, self._inflation)
                 last = node
@@ -178,14 +188,14 @@ class ScanMatcher:
             streaming = mapper.streaming_map()
             if streaming is not None:
                 state = self._match_one(ScanLikelihood.of(*streaming), rays, mount, state)
-            self._robot[node] = state.pose
-            for scan, pose in reposed(posed, self._laser(posed.position)):
+            self._node_poses[node] = state.pose
+            for scan, pose in reposed(posed, self._laser_pose(posed.position)):
                 mapper.update(scan, pose)
             if len(self._scans) == due:
                 self._match_in_rounds(1, count=last + 1)
                 mapper = self._mapper_of_scans()
                 mapper.refit_streaming_map()
-                state = FilterState(self._robot[last].copy(), self._covariances[last].copy())
+                state = FilterState(self._node_poses[last].copy(), self._covariances[last].copy())
                 due *= 2
 
     def _add(self, posed: PosedScan) -> ScanRays:
@@ -200,30 +210,29 @@ class ScanMatcher:
 
         Args:
             max_rounds: The number of rounds at most.
-            pose_error: How far poses may be off at first (m): the range noise is widened to that, so that scans
-                find their places.
+            pose_error: How far poses may be off at first (m): the range noise is enlarged to that, and then annealed.
             count: The number of nodes that the scans so far belong to; None: all.
         """
-        best, widening = -math.inf, 0.0
-        before = self._robot, self._covariances
+        best, noise_scale = -math.inf, 0.0
+        before = self._node_poses, self._covariances
         for _ in range(max_rounds):
             fit = self._mapper_of_scans().fit()
             likelihood = ScanLikelihood.of(fit, fit.noise)
-            widening = widening or self._widening(pose_error, likelihood)
-            mean, terms = self._match_all(likelihood, widening)
-            if widening == 1.0 and mean < best:
-                self._robot, self._covariances = before
-            if widening == 1.0 and mean - best < self._options.min_gain:
+            noise_scale = noise_scale or self._first_noise_scale(pose_error, likelihood)
+            mean, terms = self._match_all(likelihood, noise_scale)
+            if noise_scale == 1.0 and mean < best:
+                self._node_poses, self._covariances = before
+            if noise_scale == 1.0 and mean - best < self._options.min_gain:
                 break
-            best = mean if widening == 1.0 else best
-            widening = max(widening / 2, 1.0)
-            before = self._robot.copy(), self._covariances.copy()
+            best = mean if noise_scale == 1.0 else best
+            noise_scale = max(noise_scale / 2, 1.0)
+            before = self._node_poses.copy(), self._covariances.copy()
             self._smooth(terms, count)
 
     def _smooth(self, terms: QuadraticTerms, count: int | None) -> None:
         """Smooth the poses of the first ``count`` nodes with the scans' log-likelihoods."""
         estimate = self._fusion.smoothed(terms, self._inflation, count)
-        self._robot[:count] = estimate.poses
+        self._node_poses[:count] = estimate.poses
         self._covariances[:count] = pack_symmetric(estimate.covariances)
         self._inflation = max(self._inflation, self._step_inflation(count))
 
@@ -232,7 +241,7 @@ class ScanMatcher:
         nodes = self._fusion.nodes.subrange(0, count)
         if len(nodes.steps) < 2:
             return 1.0
-        corrections = relative_steps(self._robot[:count])[1:] - nodes.steps[1:]
+        corrections = relative_steps(self._node_poses[:count])[1:] - nodes.steps[1:]
         corrections[:, 2] = wrap_angles(corrections[:, 2])
         variances = self._fusion.step_variances(nodes)[1:]
         return min(float((corrections**2 / variances).mean()), self._options.max_inflation)
@@ -245,67 +254,79 @@ class ScanMatcher:
         """Return a mapper that was given the scans so far at the current estimates of their poses."""
         mapper = self._new_mapper()
         for posed in self._scans:
-            for scan, pose in reposed(posed, self._laser(posed.position)):
+            for scan, pose in reposed(posed, self._laser_pose(posed.position)):
                 mapper.accumulate(scan, pose)
         return mapper
 
-    def _laser(self, position: int) -> Pose2D:
+    def _laser_pose(self, position: int) -> Pose2D:
         """Return the current estimate of the laser's pose at a scan."""
-        return Pose2D(*self._robot[self._node[position]].tolist()) @ Pose2D(*self._mounts[position].tolist())
+        return Pose2D(*self._node_poses[self._node_of_scan[position]].tolist()) @ Pose2D(
+            *self._mounts[position].tolist()
+        )
 
     def _match_one(
         self, likelihood: ScanLikelihood, rays: ScanRays, mount: FloatArray, prior: FilterState
     ) -> FilterState:
-        """Return the maximum a posteriori pose by the prior and one scan, coarse to fine, and its covariance."""
+        """Return the maximum a posteriori pose by the prior and one scan, by annealing, and its covariance."""
         options, spread = self._options, prior.covariance
         prior_information = _inverse(unpack_symmetric(spread))
         pose = prior.pose.copy()
-        deviation = math.sqrt(spread[0] + spread[3] + spread[5])
-        widening = self._widening(options.widening_deviations * deviation, likelihood)
+        deviation = math.sqrt(spread[0] + spread[3] + spread[5])  # m: the heading's at a lever arm of 1 m
+        noise_scale = self._first_noise_scale(options.annealing_deviations * deviation, likelihood)
         while True:
-            pose, score = maximize_pose(likelihood, rays, mount, pose, prior.pose, prior_information, widening)
-            if widening <= 1:
+            pose, derivatives = maximize_pose(
+                likelihood, rays, mount, pose, prior.pose, prior_information, noise_scale
+            )
+            if noise_scale <= 1:
                 break
-            widening = max(widening / 2, 1.0)
-        if score.rays < options.min_rays:
+            noise_scale = max(noise_scale / 2, 1.0)
+        if derivatives.rays < options.min_rays:
             return prior
-        covariance = _inverse(prior_information + score.information)
+        covariance = _inverse(prior_information + derivatives.information)
         change = pose - prior.pose
-        # 1 in expectation where the prior's covariance is right
-        surprise = float(change @ prior_information @ change + np.trace(prior_information @ covariance)) / 3
-        inflation = self._inflation * surprise**options.inflation_rate
+        # posterior mean of the squared Mahalanobis distance from the prior, per coordinate: 1 in expectation where
+        # the prior's covariance is right
+        normalized_correction = (
+            float(change @ prior_information @ change + np.trace(prior_information @ covariance)) / 3
+        )
+        inflation = self._inflation * normalized_correction**options.inflation_rate
         self._inflation = min(max(inflation, 1.0), options.max_inflation)
         return FilterState(pose, pack_symmetric(covariance))
 
-    def _widening(self, pose_error: float, likelihood: ScanLikelihood) -> float:
-        """Return the factor of the range noise with which a scan can be matched from a pose that is off (m)."""
-        return min(max(pose_error / likelihood.noise.std, 1.0), self._options.max_widening)
+    def _first_noise_scale(self, pose_error: float, likelihood: ScanLikelihood) -> float:
+        """Return the factor of the range noise with which annealing begins for poses that are off by so much (m)."""
+        return min(max(pose_error / likelihood.noise.std, 1.0), self._options.max_noise_scale)
 
-    def _match_all(self, likelihood: ScanLikelihood, widening: float) -> tuple[float, QuadraticTerms]:
-        """Return the mean log-likelihood of a ray before, and the expansions at each node's best pose."""
-        count = len(self._robot)
+    def _match_all(self, likelihood: ScanLikelihood, noise_scale: float) -> tuple[float, QuadraticTerms]:
+        """Match each scan from its current pose.
+
+        Returns the mean log-likelihood of a ray at the current poses (nats), and the quadratic approximations at the
+        poses that the scans match best at; the range noise is multiplied by ``noise_scale`` for both.
+        """
+        count = len(self._node_poses)
         terms = QuadraticTerms(np.zeros((count, 3)), np.zeros((count, 6)), np.zeros((count, 3)))
-        trust = self._options.trust_information
+        damping = self._options.damping_information
         total, ray_count = 0.0, 0
         for posed in self._scans:
-            node, mount = self._node[posed.position], self._mounts[posed.position]
-            rays, pose = self._rays[posed.position], self._robot[node]
-            total += likelihood.log_likelihood(rays, pose, mount, widening)
+            node, mount = self._node_of_scan[posed.position], self._mounts[posed.position]
+            rays, pose = self._rays[posed.position], self._node_poses[node]
+            total += likelihood.log_likelihood(rays, pose, mount, noise_scale)
             ray_count += len(rays.rays)
-            best, score = maximize_pose(likelihood, rays, mount, pose, pose, trust, widening)
-            if score.rays >= self._options.min_rays:
-                # an expansion of another scan at this node has another center: its score is moved to this one
+            best, derivatives = maximize_pose(likelihood, rays, mount, pose, pose, damping, noise_scale)
+            if derivatives.rays >= self._options.min_rays:
+                # the terms of another scan at this node have another center: their gradient is moved to this one
                 information = unpack_symmetric(terms.information[node])
-                terms.scores[node] += score.score - information @ (best - terms.centers[node])
-                terms.information[node] += pack_symmetric(score.information)
+                terms.gradients[node] += derivatives.gradient - information @ (best - terms.centers[node])
+                terms.information[node] += pack_symmetric(derivatives.information)
                 terms.centers[node] = best
         return total / max(ray_count, 1), terms
 
     def _corrected(self) -> LaserPoses:
-        """Return the laser's poses; their covariances are the smoother's, and that of the map's own frame."""
-        robot = self._robot[self._node]
-        poses = compose_poses(robot, self._mounts)
-        covariances = compose_covariances(unpack_symmetric(self._covariances[self._node]), robot, self._mounts)
+        """Return the laser's poses; their covariances are the smoother's, plus that of the map frame's own pose."""
+        carriers = self._node_poses[self._node_of_scan]
+        carrier_covariances = unpack_symmetric(self._covariances[self._node_of_scan])
+        poses = compose_poses(carriers, self._mounts)
+        covariances = compose_covariances(carrier_covariances, carriers, self._mounts)
         # the variance of a surface's place within its cell, which the map does not resolve
         covariances[:, [0, 1], [0, 1]] += self._resolution**2 / 12
         if self._poses.frame_covariance is not None:
@@ -339,8 +360,8 @@ def reposed(posed: PosedScan, pose: Pose2D) -> Iterator[tuple[Scan, Pose2D]]:
 def _fusion_of(poses: LaserPoses, stamps: Stamps, noise: SensorNoise, options: ScanMatchingOptions) -> Fusion:
     """Return a fusion of poses that were not fused.
 
-    They are the steps of an odometry; where their noise is known, they are fixes and headings instead, and nothing is
-    known of the steps between them.
+    They are the steps of an odometry. Where their noise is known, they are fixes and headings instead, and the steps
+    between them are those of an odometry that has ``free_step_factor`` times their standard deviations each.
     """
     trajectory = Trajectory.from_unsorted(stamps[poses.valid], poses.poses[poses.valid])
     position_std, heading_std = noise.position_std, noise.heading_std
@@ -350,7 +371,7 @@ def _fusion_of(poses: LaserPoses, stamps: Stamps, noise: SensorNoise, options: S
     nodes = FusionNodes.from_readings(trajectory.stamps, trajectory, fixes, headings)
     steps = options.free_step_factor * position_std, options.free_step_factor * heading_std
     return Fusion(
-        replace(nodes, distances=np.ones(len(trajectory))), SensorNoise(position_std, heading_std, *steps, 0.0)
+        replace(nodes, variance_scales=np.ones(len(trajectory))), SensorNoise(position_std, heading_std, *steps, 0.0)
     )
 
 

@@ -21,7 +21,6 @@ from prim.log.messages import (
     POSE_WITH_COVARIANCE_TYPE,
     TRUE_POSE_TOPIC,
     VECTOR_TYPE,
-    StampedPose,
     StampedVector,
     decode_fix,
     decode_poses,
@@ -30,6 +29,7 @@ from prim.log.messages import (
 )
 from prim.log.source import LogSource, Topic
 from prim.se2 import Trajectory
+from replay.poses.transforms import is_valid_pose
 
 GPS_TYPES = (POINT_TYPE, FIX_TYPE)
 COMPASS_TYPES = (VECTOR_TYPE,)
@@ -72,7 +72,7 @@ class SensorReadings:
     Attributes:
         topic: The topic's name.
         stamps: (N,) ns, strictly rising.
-        values: (N, 3): positions in m, or vectors that point north.
+        values: Positions in m, (N, 3) of points and (N, 2) of satellite fixes; or vectors (N, 3) that point north.
         frame_id: The sensor's frame.
         skipped: How many messages cannot be used.
     """
@@ -136,11 +136,6 @@ def read_sensors(log: LogSource, odometry: Topic | None, gps: Topic | None, comp
         norths if norths and len(norths.stamps) else None,
         notes,
     )
-
-
-def is_valid_pose(pose: StampedPose) -> bool:
-    """Return whether a pose is finite and has a rotation."""
-    return bool(np.isfinite((*pose.translation, *pose.rotation)).all() and np.linalg.norm(pose.rotation) > 1e-3)
 
 
 def find_pose_topic(log: LogSource, requested: str | None = None) -> Topic | None:
@@ -278,7 +273,7 @@ def read_gps(log: LogSource, topic: Topic) -> SensorReadings:
         topic: A topic of points, which are read as they are, or of satellite fixes.
 
     Returns:
-        Positions in m; those of satellite fixes east and north of the first one.
+        Positions in m: of points (N, 3); of satellite fixes (N, 2), east and north of the first one.
 
     Raises:
         LogReadError: A message is damaged.
@@ -355,7 +350,9 @@ def geodetic_to_plane(coordinates: FloatArray) -> FloatArray:
             normal_radius * (1 - squared_eccentricity) * np.sin(latitude),
         )
     )
-    sin, cos, east, ahead = np.sin(latitude[0]), np.cos(latitude[0]), np.sin(longitude[0]), np.cos(longitude[0])
-    plane = np.array([[-east, ahead, 0.0], [-sin * ahead, -sin * east, cos]])
+    sin_lat, cos_lat = np.sin(latitude[0]), np.cos(latitude[0])
+    sin_lon, cos_lon = np.sin(longitude[0]), np.cos(longitude[0])
+    # rows: the unit vectors that point east and north at the first point
+    plane = np.array([[-sin_lon, cos_lon, 0.0], [-sin_lat * cos_lon, -sin_lat * sin_lon, cos_lat]])
     projected: FloatArray = (geocentric - geocentric[0]) @ plane.T
     return projected

@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 from prim.arrays import FloatArray, Stamps
 from prim.log.messages import MAP_FRAME, ODOM_FRAME, TF_TYPE, StampedPose, decode_poses
 from prim.log.source import LogSource
-from replay.poses.sensors import is_valid_pose
 
 FIXED_FRAMES = (MAP_FRAME, ODOM_FRAME)
 """Frames that do not move (REP 105), in order of preference."""
@@ -125,6 +124,11 @@ class TransformTree:
             translation = np.einsum("nij,nj->ni", turn, translation) + shift
             valid &= within
         return rotation, translation, valid
+
+
+def is_valid_pose(pose: StampedPose) -> bool:
+    """Return whether a pose is finite and its quaternion not close to zero; that it has unit norm is not checked."""
+    return bool(np.isfinite((*pose.translation, *pose.rotation)).all() and np.linalg.norm(pose.rotation) > 1e-3)
 
 
 def project_to_plane(

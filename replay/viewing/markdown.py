@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 
-from replay.detection import DetectionResult
+from replay.detection_stage import DetectionResult
 from replay.report import summary_rows
 from replay.result import ReplayResult
 

@@ -13,7 +13,7 @@ from prim.scan import PosedScan
 from prim.world import Bounds, World
 
 if TYPE_CHECKING:
-    from replay.detection import DetectionResult
+    from replay.detection_stage import DetectionResult
     from replay.result import ReplayResult
 
 
@@ -60,7 +60,7 @@ class Scene:
         bounds: The map's bounds (m): x0, y0, x1, y1.
         has_scores: Whether the map is scored against ground truth.
         has_pose_errors: Whether the poses are compared with the true ones.
-        has_evidence: Whether the mapper counts the rays of each cell.
+        has_visits: Whether the mapper counts the rays of each cell.
         has_detections: Whether primitives are detected.
         has_errors: Whether the detections are evaluated against ground truth.
     """
@@ -70,7 +70,7 @@ class Scene:
     bounds: Bounds
     has_scores: bool
     has_pose_errors: bool
-    has_evidence: bool = False
+    has_visits: bool = False
     has_detections: bool = False
     has_errors: bool = False
 

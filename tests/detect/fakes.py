@@ -38,20 +38,20 @@ def weights(card: ModelCard, answer: Answer) -> Weights:
 
 
 def blobs(batch: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Outputs of a YOLO that detects one solid blob an image: an anchor around it with score 0.9.
+    """Outputs of a YOLO that detects one solid blob an image: a box around it with score 0.9.
 
-    Its grey is its kind: 1.0 is a square, 0.9 a rectangle, and so on. A second anchor is the same with score 0.4.
+    Its grey is its kind: 1.0 is a square, 0.9 a rectangle, and so on. A second location has the same with score 0.4.
     """
     output = np.zeros((len(batch), 4 + len(KINDS), 2), np.float32)
     for i, image in enumerate(batch[:, 0]):
         rows, cols = np.nonzero(image > 0.55)
         if len(rows):
-            left, top, right, bottom = cols.min(), rows.min(), cols.max() + 1, rows.max() + 1
-            box = ((left + right) / 2, (top + bottom) / 2, right - left, bottom - top)
+            x0, y0, x1, y1 = cols.min(), rows.min(), cols.max() + 1, rows.max() + 1
+            box = ((x0 + x1) / 2, (y0 + y1) / 2, x1 - x0, y1 - y0)
             kind = round((1 - float(image[rows[0], cols[0]])) * 10)
-            for anchor, score in enumerate((0.9, 0.4)):
-                output[i, :4, anchor] = box
-                output[i, 4 + kind, anchor] = score
+            for location, score in enumerate((0.9, 0.4)):
+                output[i, :4, location] = box
+                output[i, 4 + kind, location] = score
     return output
 
 

@@ -12,7 +12,8 @@ from filterpy.kalman import KalmanFilter
 from detect.detection import Detection
 from detect.tracker import DEFAULTS, Tracker, TrackerOptions
 from prim.arrays import FloatArray
-from prim.shapes import Kind, Primitive, angle_difference, angle_error
+from prim.se2 import angle_difference
+from prim.shapes import Kind, Primitive, angle_error
 
 CROP = np.zeros((1, 1), np.uint8)
 SHAPES = [
@@ -70,7 +71,7 @@ def test_the_filter_agrees_with_filterpys(shape: Primitive) -> None:
             theta, period = other.x[2, 0], primitive.symmetry
             values[2] = theta + (0.0 if period is None else angle_difference(values[2], theta, period))
         other.predict(Q=noise * DEFAULTS.process_noise**2)
-        other.update(values[:, None], R=noise / max(score, DEFAULTS.min_score))
+        other.update(values[:, None], R=noise / max(score, DEFAULTS.min_weight))
     expected = Primitive(shape.kind, *other.x[:2, 0], *split(shape, other.x[2:, 0])).canonical()
     assert vector(track.primitive) == pytest.approx(vector(expected), abs=1e-9)
     assert list(track.std.values()) == pytest.approx(np.sqrt(np.diag(other.P)), abs=1e-9)

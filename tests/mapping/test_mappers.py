@@ -222,14 +222,14 @@ def map_of(session: Session, name: str, scans: int | None = None) -> tuple[Occup
     """Return a session's map at the session's own poses, and its reference map."""
     from prim.log import open_log
     from replay.posed_scans import ScanLog
-    from replay.poses.localize import Localizer
+    from replay.poses.pose_provider import PoseProvider
     from replay.selection import Selection
 
     mapper = make_mapper(name, 0.01, (-1.1, -1.1, 1.1, 1.1))
     truth = ReferenceMap(mapper.grid().frame)
     with open_log(session.path) as log:
         scan_log = ScanLog(log, None, Selection(n_scans=scans))
-        poses = Localizer(log).locate(scan_log.times, "truth")
+        poses = PoseProvider(log).laser_poses(scan_log.times, "truth")
         for position, scan in scan_log:
             pose = Pose2D(*poses.poses[position].tolist())
             mapper.update(scan, pose)

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from prim import se2
-from prim.se2 import Pose2D, Trajectory, wrap_angle, wrap_angles
+from prim.se2 import Pose2D, Trajectory, angle_difference, wrap_angle, wrap_angles
 
 COORDINATES = st.floats(-5, 5)
 POSES = st.builds(Pose2D, COORDINATES, COORDINATES, st.floats(-3, 3))
@@ -165,3 +165,11 @@ def test_wrapped_angles_are_within_a_turn_and_equal_modulo_a_turn(angle: float) 
     assert -math.pi <= wrapped <= math.pi
     assert math.cos(wrapped) == pytest.approx(math.cos(angle), abs=1e-9)
     assert wrap_angles(np.array([angle]))[0] == wrapped
+
+
+@given(st.floats(-10, 10), st.floats(-10, 10), st.floats(0.1, 7))
+def test_angle_difference_is_the_shorter_way(a: float, b: float, period: float) -> None:
+    difference = angle_difference(a, b, period)
+    assert -period / 2 - 1e-9 <= difference <= period / 2 + 1e-9
+    turns = (a - b - difference) / period
+    assert turns == pytest.approx(round(turns), abs=1e-6)

@@ -6,7 +6,7 @@ import shapely
 from hypothesis import given
 from hypothesis import strategies as st
 
-from prim.shapes import Kind, Primitive, angle_difference, angle_error
+from prim.shapes import Kind, Primitive, angle_error
 
 LENGTHS = st.floats(0.02, 0.5)
 ANGLES = st.floats(-10, 10)
@@ -110,12 +110,11 @@ def test_the_papers_example_of_a_square_turned_by_a_right_angle() -> None:
     assert angle_error(estimate, truth) == pytest.approx(0, abs=1e-12)
 
 
-@given(ANGLES, ANGLES, st.floats(0.1, 7))
-def test_angle_difference_is_the_shorter_way(a: float, b: float, period: float) -> None:
-    difference = angle_difference(a, b, period)
-    assert -period / 2 - 1e-9 <= difference <= period / 2 + 1e-9
-    turns = (a - b - difference) / period
-    assert turns == pytest.approx(round(turns), abs=1e-6)
+def test_the_bounding_radius_is_about_the_centroid() -> None:
+    """A right isosceles triangle: the circumscribed circle has another centre and is smaller."""
+    triangle = Primitive(Kind.TRIANGLE, 0, 0, 0.3, (0.2, 0.1))
+    assert triangle.bounding_radius == pytest.approx(math.hypot(0.1, 0.1 / 3))
+    assert triangle.bounding_radius > 0.1 + 1e-3  # half the hypotenuse: the circumscribed circle
 
 
 def test_width_and_height_are_the_papers() -> None:

@@ -154,7 +154,7 @@ def test_wheel_speeds_move_the_robot_by_differential_drive_kinematics(left: floa
     before = simulator.pose
     simulator.drive(left, right, 1.0)
     step = before.inverse() @ simulator.pose
-    turn = (right - left) / SimulatorOptions().axle
+    turn = (right - left) / SimulatorOptions().track_width
     ahead = (left + right) / 2
     expected = Pose2D(
         ahead * (math.sin(turn) / turn if turn else 1), ahead * ((1 - math.cos(turn)) / turn if turn else 0), turn

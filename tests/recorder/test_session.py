@@ -193,7 +193,8 @@ def test_metadata_keep_their_keys_and_name_options_that_are_not_the_defaults(tmp
     assert described[0].keys() == common | {"lidar", "gps", "compass", "odometry"}
     assert json.loads(described[0]["odometry"]) == {"metres": 0.05, "radians": math.radians(2)}
     assert described[1].keys() == described[0].keys() | {"simulator"}
-    assert json.loads(described[1]["simulator"])["tyre_friction"] == 0.5
+    simulator = json.loads(described[1]["simulator"])
+    assert (simulator["tyre_friction"], simulator["axle"]) == (0.5, SimulatorOptions().track_width)
 
 
 def test_a_world_is_read_from_a_file(tmp_path: Path) -> None:

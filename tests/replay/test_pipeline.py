@@ -27,7 +27,7 @@ from replay.options import ReplayOptions
 from replay.pipeline import Pipeline
 from replay.result import ReplayResult
 from replay.timing import StageTimer
-from tests.replay.poses.test_localize import raw_transform
+from tests.replay.poses.test_pose_provider import raw_transform
 
 STAMP = 5 * 10**9
 POSE = Pose2D(0.2, -0.1, 0.7)

@@ -13,9 +13,9 @@ from prim.log import open_log
 from prim.scan import PosedScan, Scan
 from prim.se2 import Pose2D
 from recorder.session import Session
-from replay.detection import ScanSubset
+from replay.detection_stage import ScanSubset
 from replay.posed_scans import PosedScanOptions, PosedScans, ScanLog
-from replay.poses.localize import Localizer
+from replay.poses.pose_provider import PoseProvider
 from replay.selection import Selection
 from replay.timing import MAX_WAIT, RatePacer, StageTimer
 
@@ -26,7 +26,7 @@ def posed_scans(
     """Read a session's scans; those before ``first_valid`` have no pose."""
     with open_log(session.path) as log:
         scans = ScanLog(log, None, Selection())
-        poses = Localizer(log).locate(scans.times, "truth")
+        poses = PoseProvider(log).laser_poses(scans.times, "truth")
         poses = replace(poses, valid=np.arange(len(scans)) >= first_valid)
         posed = PosedScans(scans, poses, options or PosedScanOptions(), timer)
         first, second = list(posed), list(posed)

@@ -76,7 +76,7 @@ def test_the_e_step_agrees_with_the_reference(seed: int, sigma: float) -> None:
     rng = np.random.default_rng(seed)
     o = random_stopping(rng)
     rays, plain = random_rays(rng)
-    sums, statistics = level_of(o).expect(rays, RangeNoise(sigma, 0.01), with_certainty=True)
+    sums, statistics = level_of(o).expect(rays, RangeNoise(sigma, 0.01), with_arrival=True)
     expected = reference.expect(plain, LIMITS, o.astype(float), sigma, 0.01)
     found = sums.sum(axis=0).reshape(SIZE, SIZE, 3)
     assert expected.worst_sum < 1e-12
@@ -117,12 +117,12 @@ def test_the_m_step_of_the_sieve_is_exact() -> None:
     n = len(weights) // 2
     line = np.array([[weights[n + j - i] if abs(i - j) <= n else 0.0 for j in range(SIZE)] for i in range(SIZE)])
     line /= line.sum(axis=1, keepdims=True)
-    blur = np.kron(line, line)
-    o = blur @ p.ravel()
+    smoothing = np.kron(line, line)
+    o = smoothing @ p.ravel()
     assert level.stopping.ravel() == pytest.approx(o, rel=1e-4)
     sums = rng.uniform(0, 5, (2, SIZE * SIZE, 2)).astype(np.float32)
     hits, passes = sums.sum(axis=0).T
-    up, down = p.ravel() * (blur.T @ (hits / o)), (1 - p.ravel()) * (blur.T @ (passes / (1 - o)))
+    up, down = p.ravel() * (smoothing.T @ (hits / o)), (1 - p.ravel()) * (smoothing.T @ (passes / (1 - o)))
     level.maximize(sums)
     assert level.parameters.ravel() == pytest.approx(up / (up + down), rel=1e-3)
 
@@ -309,7 +309,7 @@ def test_cells_that_no_ray_reached_are_unknown() -> None:
     for _ in range(10):
         mapper.update(scan, Pose2D())
     grid = mapper.finish()
-    assert grid.evidence is not None
+    assert grid.visits is not None
     row = grid.probability[40]
     assert (row[:35] == 0.5).all() and (row[42:58] < 0.1).all() and row[60] > 0.9 and (row[66:] == 0.5).all()
 
@@ -424,7 +424,7 @@ def test_the_image_of_a_grid(noisiest: Session) -> None:
     assert image.shape == (*grid.frame.shape, 3) and image.dtype == np.uint8
     assert (image[..., 2] == np.where(grid.probability == 0.5, 0, 255)).all()
     assert image[grid.probability > 0.99][:, 0].min() > 250
-    assert (np.diff(image[..., 1].ravel()[np.argsort(grid.evidence.ravel())].astype(int)) >= 0).all()  # type: ignore[union-attr]
+    assert (np.diff(image[..., 1].ravel()[np.argsort(grid.visits.ravel())].astype(int)) >= 0).all()  # type: ignore[union-attr]
 
 
 @pytest.mark.parametrize(("noise_cells", "factors"), [(1.0, [4, 2, 1]), (16.0, [4, 2, 1]), (16.5, [8, 4, 2, 1])])

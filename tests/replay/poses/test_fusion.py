@@ -11,7 +11,7 @@ from prim.arrays import FloatArray, Stamps
 from prim.metrics import pose_nees, pose_rmse
 from prim.se2 import Trajectory, integrate_steps, wrap_angles
 from replay.poses.fusion import Fusion, PoseEstimate
-from replay.poses.fusion_nodes import FusionNodes, travelled_distances
+from replay.poses.fusion_nodes import FusionNodes, weighted_path_lengths
 from replay.poses.fusion_options import FusionOptions, NoiseEstimationOptions, SensorNoise
 from replay.poses.kalman import REJECTED
 
@@ -66,7 +66,7 @@ def test_filter_agrees_with_filterpy() -> None:
     other.x, other.P = initial.pose, np.diag(initial.covariance[[0, 3, 5]])
     nodes = fusion.nodes
     for k in range(len(nodes.stamps)):
-        step, distance = nodes.steps[k], nodes.distances[k]
+        step, distance = nodes.steps[k], nodes.variance_scales[k]
         cos, sin = math.cos(other.x[2]), math.sin(other.x[2])
         moved = np.array([cos * step[0] - sin * step[1], sin * step[0] + cos * step[1], step[2]])
         other.F = np.array([[1, 0, -moved[1]], [0, 1, moved[0]], [0, 0, 1]])
@@ -90,7 +90,7 @@ def test_smoother_and_frame_covariance_agree_with_the_joint_posterior() -> None:
     still = Trajectory(stamps, np.tile([0.4, 0.2, 0.1], (count, 1)))
     fixes, headings = 0.3 + rng.normal(0, 0.1, (count, 2)), 0.1 + rng.normal(0, 0.05, count)
     nodes = replace(
-        FusionNodes.from_readings(stamps, still, (stamps, fixes), (stamps, headings)), distances=np.ones(count)
+        FusionNodes.from_readings(stamps, still, (stamps, fixes), (stamps, headings)), variance_scales=np.ones(count)
     )
     fusion = Fusion(nodes, SensorNoise(0.1, 0.05, place, turn, 0.0))
     found = fusion.smoothed()
@@ -260,12 +260,14 @@ def test_subset_of_nodes_has_the_same_trajectory(stride: int) -> None:
     nodes = drive(9).nodes()
     thin = nodes.subset(np.arange(0, len(nodes.stamps), stride))
     assert integrate_steps(thin.steps)[-1] == pytest.approx(integrate_steps(nodes.steps)[::stride][-1], abs=1e-9)
-    assert thin.distances.sum() == pytest.approx(nodes.distances[: stride * (len(thin.distances) - 1) + 1].sum())
+    assert thin.variance_scales.sum() == pytest.approx(
+        nodes.variance_scales[: stride * (len(thin.variance_scales) - 1) + 1].sum()
+    )
 
 
 def test_travelled_distance_includes_turns() -> None:
     turned = Trajectory(np.arange(3), np.array([[0, 0, 0], [0.3, 0.4, 0], [0.3, 0.4, 1.0]]))
-    assert travelled_distances(turned, 0.03) == pytest.approx([0, 0.5, 0.53])
+    assert weighted_path_lengths(turned, 0.03) == pytest.approx([0, 0.5, 0.53])
 
 
 def test_gates_reject_one_in_a_thousand() -> None:

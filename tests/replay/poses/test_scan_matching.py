@@ -25,7 +25,7 @@ from replay.pipeline import Pipeline
 from replay.posed_scans import PosedScans, ScanLog
 from replay.poses.fusion_options import SensorNoise
 from replay.poses.laser_poses import FUSED, LaserPoses
-from replay.poses.localize import Localizer
+from replay.poses.pose_provider import PoseProvider
 from replay.poses.scan_matching import match_scans
 from replay.selection import Selection
 
@@ -69,8 +69,8 @@ def test_matching_recovers_the_true_pose(likelihood: ScanLikelihood, mount: Pose
     beams = ScanRays.from_pieces([(scan, laser)], laser, 200)
     start = true + np.array([0.02, -0.015, 0.02])
     nearer, _ = maximize_pose(likelihood, beams, at, start, start, np.zeros((3, 3)), noise_scale=2.0)
-    pose, score = maximize_pose(likelihood, beams, at, nearer, nearer, np.zeros((3, 3)))
-    std = np.sqrt(np.diag(np.linalg.inv(score.information)))
+    pose, derivatives = maximize_pose(likelihood, beams, at, nearer, nearer, np.zeros((3, 3)))
+    std = np.sqrt(np.diag(np.linalg.inv(derivatives.information)))
     assert np.abs(pose - true) == pytest.approx(0, abs=5 * std.max())
     assert std[:2].max() < 0.006 and std[2] < 0.01
     assert likelihood.log_likelihood(beams, pose, at) > likelihood.log_likelihood(
@@ -78,16 +78,16 @@ def test_matching_recovers_the_true_pose(likelihood: ScanLikelihood, mount: Pose
     )
 
 
-def test_score_is_the_gradient_of_the_log_likelihood(likelihood: ScanLikelihood) -> None:
+def test_the_gradient_is_that_of_the_log_likelihood(likelihood: ScanLikelihood) -> None:
     laser = Pose2D(0.05, -0.45, 1.0)
     beams = ScanRays.from_pieces([(scans_of([laser])[0], laser)], laser, 200)
     pose = np.array([0.06, -0.46, 1.01])
-    evaluated = likelihood.score(beams, pose, NO_MOUNT)
+    evaluated = likelihood.derivatives(beams, pose, NO_MOUNT)
     step = max(0.5 * 0.01, 0.2 * likelihood.noise.std)
     for axis in range(3):
         nudge = step * np.eye(3)[axis]
         up, down = (likelihood.log_likelihood(beams, pose + sign * nudge, NO_MOUNT) for sign in (1, -1))
-        assert evaluated.score[axis] == pytest.approx((up - down) / (2 * step), rel=1e-6, abs=1e-6)
+        assert evaluated.gradient[axis] == pytest.approx((up - down) / (2 * step), rel=1e-6, abs=1e-6)
     assert evaluated.log_likelihood == pytest.approx(likelihood.log_likelihood(beams, pose, NO_MOUNT))
     assert np.linalg.eigvalsh(evaluated.information).min() > 0
 
@@ -114,8 +114,8 @@ def driven(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_matched_poses_are_more_accurate(driven: Path, source: str, share: float) -> None:
     with open_log(driven) as log:
         scans = ScanLog(log, None, Selection())
-        truth = Localizer(log).locate(scans.times, "truth").poses
-        poses = Localizer(log).locate(scans.times, source)
+        truth = PoseProvider(log).laser_poses(scans.times, "truth").poses
+        poses = PoseProvider(log).laser_poses(scans.times, source)
         matched = match_scans(poses, scans.stamps, partial(PosedScans, scans), 0.02)
     before, after = pose_rmse(poses.poses, truth), pose_rmse(matched.poses, truth)
     assert after[0] < share * before[0] and after[1] < before[1]
@@ -126,7 +126,7 @@ def test_matched_poses_are_more_accurate(driven: Path, source: str, share: float
 def test_matching_reduces_the_noise_of_poses_that_do_not_drift(driven: Path) -> None:
     with open_log(driven) as log:
         scans = ScanLog(log, None, Selection())
-        truth = Localizer(log).locate(scans.times, "truth")
+        truth = PoseProvider(log).laser_poses(scans.times, "truth")
         rng = np.random.default_rng(1)
         noise = np.column_stack((rng.normal(0, 0.1, (len(truth.poses), 2)), rng.normal(0, 0.03, len(truth.poses))))
         noisy = replace(truth, poses=truth.poses + noise)
@@ -219,7 +219,7 @@ def test_end_poses_follow_corrected_poses(driven: Path) -> None:
     with open_log(driven) as log:
         scans = ScanLog(log, None, Selection(n_scans=20))
         times = replace(scans.times, sweep=10**8)
-        poses = Localizer(log).locate(times, "odom")
+        poses = PoseProvider(log).laser_poses(times, "odom")
         assert poses.end_poses is not None
 
         def posed(of: LaserPoses) -> Iterator[PosedScan]:

@@ -23,9 +23,9 @@ from prim.log.messages import (
 from prim.se2 import Pose2D, wrap_angles
 from replay.poses.fusion_options import FusionInputs
 from replay.poses.laser_poses import FUSED
-from replay.poses.localize import Localizer
+from replay.poses.pose_provider import PoseProvider
 from replay.poses.sensors import compass_headings, find_compass, find_gps, geodetic_to_plane, read_compass, read_gps
-from tests.replay.poses.test_localize import (
+from tests.replay.poses.test_pose_provider import (
     DRIVE,
     SECOND,
     TIMES,
@@ -95,7 +95,7 @@ COMPASS = north_vectors("/compass", *((t, 0.0) for t, _ in DRIVE_X))
 
 def test_fused_poses_agree_with_gps_and_compass(tmp_path: Path) -> None:
     with log_of(tmp_path / "a.mcap", STRAIGHT, GPS, COMPASS) as log:
-        located = Localizer(log).locate(TIMES, FUSED)
+        located = PoseProvider(log).laser_poses(TIMES, FUSED)
         assert located.source == FUSED and located.origin == "/odom, /gps, /compass"
         assert located.poses[:, 0] == pytest.approx([5, 6, 7], abs=0.05)
         assert located.poses[:, 1] == pytest.approx([7, 7, 7], abs=0.05)
@@ -104,11 +104,11 @@ def test_fused_poses_agree_with_gps_and_compass(tmp_path: Path) -> None:
 
 def test_fused_poses_do_not_depend_on_order_and_duplicates(tmp_path: Path) -> None:
     with log_of(tmp_path / "a.mcap", STRAIGHT, GPS, COMPASS) as log:
-        expected = Localizer(log).locate(TIMES, FUSED)
+        expected = PoseProvider(log).laser_poses(TIMES, FUSED)
     shuffled = points("/gps", *((t, x + 5, 7) for t, x in (DRIVE_X[2], DRIVE_X[0], DRIVE_X[1], DRIVE_X[1])))
     twice = odometry("/odom", *((t, Pose2D(x, 0, 0)) for t, x in (*DRIVE_X[::-1], DRIVE_X[0])))
     with log_of(tmp_path / "b.mcap", twice, shuffled, COMPASS) as log:
-        assert Localizer(log).locate(TIMES, FUSED).poses == pytest.approx(expected.poses)
+        assert PoseProvider(log).laser_poses(TIMES, FUSED).poses == pytest.approx(expected.poses)
 
 
 @pytest.mark.parametrize(
@@ -122,26 +122,26 @@ def test_fused_poses_do_not_depend_on_order_and_duplicates(tmp_path: Path) -> No
 )
 def test_auto_fuses_the_available_sensors(tmp_path: Path, writers: tuple[Write, ...], origin: str) -> None:
     with log_of(tmp_path / "a.mcap", *writers) as log:
-        located = Localizer(log).locate(TIMES)
+        located = PoseProvider(log).laser_poses(TIMES)
         assert (located.source, located.origin) == (FUSED, origin)
 
 
 def test_auto_prefers_the_ground_truth_and_a_tf_chain_to_map(tmp_path: Path) -> None:
     localized = transforms("/tf", *((t, "map", "laser", Pose2D(x, 0, 0)) for t, x in DRIVE_X))
     with log_of(tmp_path / "a.mcap", STRAIGHT, GPS, localized) as log:
-        assert Localizer(log).locate(TIMES).source == "tf"
+        assert PoseProvider(log).laser_poses(TIMES).source == "tf"
     with log_of(tmp_path / "b.mcap", STRAIGHT, GPS, truth(*((t, Pose2D(x, 0, 0)) for t, x in DRIVE_X))) as log:
-        assert Localizer(log).locate(TIMES).source == "truth"
+        assert PoseProvider(log).laser_poses(TIMES).source == "truth"
 
 
 def test_clicked_point_is_not_taken_for_a_gps(tmp_path: Path) -> None:
     with log_of(tmp_path / "a.mcap", STRAIGHT, points("/prefix/clicked_point", (1.0, 3, 3))) as log:
-        assert Localizer(log).locate(TIMES).source == "odom"
+        assert PoseProvider(log).laser_poses(TIMES).source == "odom"
 
 
 def test_gps_topic_of_any_name_can_be_requested(tmp_path: Path) -> None:
     with log_of(tmp_path / "a.mcap", STRAIGHT, points("/beacon", *((t, x, 7) for t, x in DRIVE_X)), COMPASS) as log:
-        located = Localizer(log, inputs=FusionInputs(gps_topic="/beacon")).locate(TIMES, FUSED)
+        located = PoseProvider(log, inputs=FusionInputs(gps_topic="/beacon")).laser_poses(TIMES, FUSED)
         assert located.origin == "/odom, /beacon, /compass"
 
 
@@ -155,21 +155,21 @@ def test_several_gps_topics_are_listed(tmp_path: Path) -> None:
 
 def test_error_without_enough_sensors_lists_the_available_ones(tmp_path: Path) -> None:
     with log_of(tmp_path / "a.mcap", GPS) as log, pytest.raises(LogReadError, match=r"need odometry.*there is /gps"):
-        Localizer(log).locate(TIMES, FUSED)
+        PoseProvider(log).laser_poses(TIMES, FUSED)
 
 
 def test_fusion_of_odometry_alone_is_reported(tmp_path: Path) -> None:
     with log_of(tmp_path / "a.mcap", DRIVE) as log:
-        located = Localizer(log).locate(TIMES, FUSED)
+        located = PoseProvider(log).laser_poses(TIMES, FUSED)
         assert "no GPS and no compass: fused poses are those of /odom" in located.notes
-        assert located.poses == pytest.approx(Localizer(log).locate(TIMES, "odom").poses, abs=1e-6)
+        assert located.poses == pytest.approx(PoseProvider(log).laser_poses(TIMES, "odom").poses, abs=1e-6)
 
 
 def test_sensors_on_another_clock_are_an_error(tmp_path: Path) -> None:
     late = [odometry("/odom", (900.0, Pose2D()), (901.0, Pose2D()))]
     error = pytest.raises(LogReadError, match=r"no scan .* lies within the time of .*two clocks")
     with log_of(tmp_path / "a.mcap", *late, points("/gps", (900.5, 0, 0))) as log, error:
-        Localizer(log).locate(TIMES, FUSED)
+        PoseProvider(log).laser_poses(TIMES, FUSED)
 
 
 def test_values_that_are_not_finite_are_skipped_and_reported(tmp_path: Path) -> None:
@@ -210,7 +210,7 @@ def test_compass_may_be_mounted_upside_down(tmp_path: Path) -> None:
 
     spin = odometry("/odom", *((t, Pose2D(0, 0, turn)) for (t, _), turn in zip(DRIVE_X, angles, strict=True)))
     with log_of(tmp_path / "a.mcap", mount, mirrored, spin) as log:
-        assert Localizer(log).locate(TIMES, FUSED).poses[:, 2] == pytest.approx(angles, abs=0.01)
+        assert PoseProvider(log).laser_poses(TIMES, FUSED).poses[:, 2] == pytest.approx(angles, abs=0.01)
 
 
 def test_satellite_fixes_are_projected_to_east_and_north(tmp_path: Path) -> None:
@@ -232,15 +232,15 @@ def test_auto_falls_back_to_tf_and_reports_why(tmp_path: Path) -> None:
     moving = transforms("/tf", *((t, "odom", "laser", Pose2D(x, 0, 0)) for t, x in DRIVE_X))
     indoors = satellites("/fix", (1.0, 52.0, 13.0), status=-1)
     with log_of(tmp_path / "a.mcap", moving, indoors, COMPASS) as log:
-        located = Localizer(log).locate(TIMES)
+        located = PoseProvider(log).laser_poses(TIMES)
         assert located.source == "tf" and any(note.startswith("nothing is fused: ") for note in located.notes)
     with log_of(tmp_path / "b.mcap", moving, GPS, goal("/goal_pose", 3.0)) as log:
-        assert Localizer(log).locate(TIMES).source == "tf"
+        assert PoseProvider(log).laser_poses(TIMES).source == "tf"
 
 
 def test_skipped_messages_are_reported_where_no_reading_remains(tmp_path: Path) -> None:
     with log_of(tmp_path / "a.mcap", STRAIGHT, points("/gps", (1.0, math.nan, 0)), COMPASS) as log:
-        located = Localizer(log).locate(TIMES, FUSED)
+        located = PoseProvider(log).laser_poses(TIMES, FUSED)
         assert "/gps: 1 messages without a usable value were skipped" in located.notes
         assert [sensor.name for sensor in located.sensors] == ["odom", "compass"]
         assert "m" not in located.sensors[0].std  # the noise of the odometry's position cannot be estimated
@@ -262,7 +262,7 @@ def test_lever_arm_of_the_antenna_is_read_from_tf(tmp_path: Path) -> None:
         points("/gps", *((t, x + 5, 7) for t, x in DRIVE_X), frame="antenna"),
         mounted,
     ) as log:
-        located = Localizer(log).locate(TIMES, FUSED)
+        located = PoseProvider(log).laser_poses(TIMES, FUSED)
         assert located.poses[:, 0] == pytest.approx([4.5, 5.5, 6.5], abs=0.05)
 
 

@@ -9,8 +9,7 @@ from mapping.map_metrics import MapScores
 from mapping.reference_map import ReferenceMap
 from prim.metrics import pose_nees, pose_rmse
 from prim.scan import PosedScan
-from prim.se2 import Pose2D
-from prim.shapes import angle_difference
+from prim.se2 import Pose2D, angle_difference
 from prim.world import World
 from replay.ground_truth import GroundTruth
 from replay.poses.laser_poses import STILL, LaserPoses
@@ -20,7 +19,7 @@ class ReplayEvaluator:
     """Compares maps and poses with the ground truth, where the log has one.
 
     Args:
-        frame: The frame of the maps that are scored.
+        frame: The place and size of the grid of the maps that are scored.
         truth: The true world; None where the log has none.
         poses: The laser's poses that the replay uses.
         true_poses: The laser's true poses; None where the log has none.
@@ -46,7 +45,10 @@ class ReplayEvaluator:
 
     @property
     def comparable_truth(self) -> GroundTruth | None:
-        """The true world in the frame of the map; None where either is not known."""
+        """The true world where the true poses are known too, so that the map can be compared with it; else None.
+
+        That the map's frame is the true world's is assumed, not checked: maps are not aligned before they are scored.
+        """
         return self._truth if self.scores_maps else None
 
     def world(self, stamp: int) -> World | None:

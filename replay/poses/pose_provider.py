@@ -31,8 +31,8 @@ from replay.poses.transforms import project_to_plane
 
 
 @dataclass(frozen=True)
-class LocalizerOptions:
-    """The numbers of localization; set by hand."""
+class PoseProviderOptions:
+    """The numbers of :class:`PoseProvider`; set by hand."""
 
     max_gap: float = 1.0
     """Poses further apart (s) are interpolated over a gap, which is reported."""
@@ -46,15 +46,18 @@ class LocalizerOptions:
     fusion: FusionOptions = field(default_factory=FusionOptions)
 
 
-DEFAULTS = LocalizerOptions()
+DEFAULTS = PoseProviderOptions()
 
 
-class Localizer:
-    """Finds the laser's poses in a log.
+class PoseProvider:
+    """Provides the laser's pose at every scan, from what a log holds: true poses, tf, odometry, or several sensors.
+
+    Scans are not matched here; see :func:`replay.poses.scan_matching.match_scans`.
 
     Args:
         log: The log.
-        odom_topic: The topic of the robot's poses; None: found by type.
+        odom_topic: The topic of the robot's poses, or of the odometry to be fused; None: found by type. Where one is
+            given, the source ``auto`` means ``odom``.
         laser_offset: The laser's pose on the robot, in place of tf.
         inputs: What poses are fused from.
         options: Gaps, tilts, and the numbers of the fusion.
@@ -66,7 +69,7 @@ class Localizer:
         odom_topic: str | None = None,
         laser_offset: Pose2D | None = None,
         inputs: FusionInputs | None = None,
-        options: LocalizerOptions = DEFAULTS,
+        options: PoseProviderOptions = DEFAULTS,
     ) -> None:
         self._log = log
         self._odom_topic = odom_topic
@@ -75,13 +78,14 @@ class Localizer:
         self._options = options
         self._mounts = SensorMounts(log, laser_offset, options.min_upright)
 
-    def locate(self, scans: ScanTimes, source: str = "auto") -> LaserPoses:
+    def laser_poses(self, scans: ScanTimes, source: str = "auto") -> LaserPoses:
         """Find the laser's pose at every scan.
 
         Args:
             scans: When the scans were taken.
-            source: One of laser_poses.SOURCES. ``auto`` takes the ground truth, else a tf chain to ``map``, else what
-                can be fused with a GPS or a compass, else any tf chain, else odometry.
+            source: One of laser_poses.SOURCES. ``auto`` means ``odom`` where an ``odom_topic`` was given; else it
+                takes the ground truth, else a tf chain to ``map``, else what can be fused with a GPS or a compass,
+                else any tf chain, else odometry.
 
         Returns:
             The poses; those of scans outside the time of the source are marked as invalid.
@@ -89,24 +93,24 @@ class Localizer:
         Raises:
             LogReadError: The source is not there or cannot be used, or no scan lies within its time.
         """
-        located = _split_end_poses(self._locate(scans, source), len(scans.stamps))
-        if not located.valid.any():
+        poses = _split_end_poses(self._poses_from(source, scans), len(scans.stamps))
+        if not poses.valid.any():
             first, last = scans.stamps.min() / 1e9, scans.stamps.max() / 1e9
             raise LogReadError(
                 self._log.path,
-                f"no scan (stamps {first:.3f} to {last:.3f} s) lies within the time of the poses on {located.origin}",
+                f"no scan (stamps {first:.3f} to {last:.3f} s) lies within the time of the poses on {poses.origin}",
                 "two clocks in one log? give another --pose or --odom-topic",
             )
-        return located
+        return poses
 
-    def stand_still(self, scans: ScanTimes) -> LaserPoses:
-        """Place a robot at the map's origin at all times, with the laser where the offset or tf puts it.
+    def stationary_poses(self, scans: ScanTimes) -> LaserPoses:
+        """Return the poses of a robot that stands at the map's origin at all times.
 
         Args:
             scans: When the scans were taken.
 
         Returns:
-            The laser's poses, all valid.
+            The laser's poses, all valid, where the offset or tf puts it.
         """
         mounts, upside_down, _ = self._mounts.laser_mounts(scans, BASE_FRAME)
         valid = np.ones(len(mounts), dtype=bool)
@@ -119,8 +123,8 @@ class Localizer:
         topic = self._log.topics.get(TRUE_POSE_TOPIC)
         return topic is not None and topic.messages > 0 and topic.type == POSE_TYPE
 
-    def _locate(self, scans: ScanTimes, source: str) -> LaserPoses:
-        """Return the poses at all query stamps."""
+    def _poses_from(self, source: str, scans: ScanTimes) -> LaserPoses:
+        """Return the poses at all query stamps, by the source that is asked for or that ``auto`` chooses."""
         if source == "auto" and self._odom_topic is not None:
             source = "odom"
         if source == "truth" or (source == "auto" and self.has_truth):
@@ -140,8 +144,8 @@ class Localizer:
                     raise
                 reason = (f"nothing is fused: {error.what}",)
         use_tf = source == "tf" or len(chain) > 1
-        located = self._from_tf(scans, chain) if use_tf else self._from_odometry(scans, source)
-        return replace(located, notes=located.notes + reason)
+        poses = self._from_tf(scans, chain) if use_tf else self._from_odometry(scans, source)
+        return replace(poses, notes=poses.notes + reason)
 
     def _from_truth(self, scans: ScanTimes) -> LaserPoses:
         if not self.has_truth:
@@ -299,22 +303,22 @@ class Localizer:
         return notes
 
 
-def _split_end_poses(located: LaserPoses, scans: int) -> LaserPoses:
+def _split_end_poses(queried: LaserPoses, scans: int) -> LaserPoses:
     """Separate the poses at the last beams from those at the first, which stand in where a last one is not known."""
-    if len(located.poses) == scans:
-        return located
+    if len(queried.poses) == scans:
+        return queried
 
     def first(rows: FloatArray | None) -> FloatArray | None:
         return None if rows is None else rows[:scans]
 
-    poses, known = located.poses[:scans], located.valid[scans:, None]
+    poses, known = queried.poses[:scans], queried.valid[scans:, None]
     return replace(
-        located,
+        queried,
         poses=poses,
-        valid=located.valid[:scans],
-        end_poses=np.where(known, located.poses[scans:], poses),
-        covariances=first(located.covariances),
-        mounts=first(located.mounts),
+        valid=queried.valid[:scans],
+        end_poses=np.where(known, queried.poses[scans:], poses),
+        covariances=first(queried.covariances),
+        mounts=first(queried.mounts),
     )
 
 

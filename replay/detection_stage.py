@@ -11,15 +11,15 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from detect.networks.weights import shipped_weights
-from mapping.forward.mapper import cores
 from mapping.grid import GridFrame, OccupancyGrid
 from mapping.mapper import Mapper, make_mapper
 from prim.arrays import FloatArray
 from prim.errors import UsageError
 from prim.metrics import DetectionErrors, detection_errors
 from prim.scan import PosedScan, Scan
-from prim.se2 import Pose2D
+from prim.se2 import Pose2D, frame_covariances
 from prim.shapes import Primitive
+from prim.threads import cores
 from replay.ground_truth import GroundTruth
 from replay.options import ReplayOptions
 from replay.posed_scans import PosedScans
@@ -58,8 +58,8 @@ class TrackIdentity:
     """The track that a detection belongs to.
 
     Attributes:
-        id: The track's number.
-        confirmed: Whether the track is confirmed; tentative otherwise.
+        id: The track's number; without a tracker, the detection's position in the list, from 1 on.
+        confirmed: Whether the track is confirmed; tentative otherwise. Always true without a tracker.
         std: Standard deviations of the track's parameters by name (m, rad); None without a tracker.
     """
 
@@ -74,7 +74,7 @@ class DetectionResult:
 
     Attributes:
         detections: The detections and the candidates that were rejected.
-        identities: The track of each detection.
+        identities: The track of each detection; without a tracker, its number.
         noise_std: The range noise that refinement estimated or was given (m); None without refinement.
         truth: The true primitives; empty without ground truth.
         errors: How the detections compare with the truth; None without ground truth.
@@ -225,8 +225,8 @@ class DetectionStage:
     Args:
         detector: The networks.
         options: Options of the replay.
-        frame: The frame of the replay's map.
-        truth: The true world in that frame; None where it is not known.
+        frame: The place and size of the grid of the replay's map.
+        truth: The true world, in coordinates of the map; None where it is not known.
         frame_covariance: The covariance (3, 3; m, rad) of the map frame's own pose; None where it is exact.
         timer: Counts the time towards the stages «detect» and «refine».
     """
@@ -258,6 +258,9 @@ class DetectionStage:
     def update(self, posed: PosedScan, mapper: Mapper) -> DetectionResult | None:
         """Add a scan, and detect primitives in the map so far where that is due.
 
+        With an interval of N, that is after the scans at positions N - 1, 2N - 1 and so on in the selection: after N,
+        2N and so on scans, where all have a pose.
+
         Args:
             posed: The scan, which the replay's map has already.
             mapper: The replay's mapper.
@@ -277,7 +280,7 @@ class DetectionStage:
                 detections, noise_std = self._refiner.refine_so_far(detections, grid)
         return self._result(detections, posed.scan.stamp, noise_std)
 
-    def finish(self, grid: OccupancyGrid, posed_scans: PosedScans) -> DetectionResult | None:
+    def finish(self, grid: OccupancyGrid, posed_scans: PosedScans) -> DetectionResult:
         """Detect primitives in the final map.
 
         Args:
@@ -354,16 +357,19 @@ def make_detection_stage(
 
     Args:
         options: Options of the replay.
-        frame: The frame of the replay's map.
-        truth: The true world in that frame; None where it is not known.
+        frame: The place and size of the grid of the replay's map.
+        truth: The true world, in coordinates of the map; None where it is not known.
         frame_covariance: The covariance (3, 3; m, rad) of the map frame's own pose; None where it is exact.
         timer: Counts the time of loading towards the stage «detect».
 
     Returns:
-        The stage; a :class:`NoDetection` where detection is not wanted, or not possible and not explicitly asked for.
+        The stage; a :class:`NoDetection` where detection is not wanted, or where it was not explicitly asked for and
+        there are no weights for the mapper, or the detector's own map would have too many cells.
 
     Raises:
-        UsageError: Detection was explicitly asked for, by weights or an interval, and is not possible.
+        UsageError: Detection was explicitly asked for, by weights or an interval, and there are no weights for the
+            mapper, or the detector's own map would have too many cells.
+        WeightsError: The weights cannot be used, whether or not detection was explicitly asked for.
     """
     if not options.detect:
         return NoDetection()
@@ -407,7 +413,7 @@ def add_frame_uncertainty(
 ) -> dict[str, float]:
     """Add the uncertainty of the map frame's own pose to a primitive's.
 
-    The pose of a primitive at (x, y) changes with the frame's by the Jacobian [[1, 0, -y], [0, 1, x], [0, 0, 1]].
+    Both errors are taken as independent (see :func:`prim.se2.frame_covariances`).
 
     Args:
         primitive: The primitive.
@@ -417,7 +423,7 @@ def add_frame_uncertainty(
     Returns:
         The standard deviations with both added in quadrature, by name (m, rad).
     """
-    jacobian = np.array([[1, 0, -primitive.y], [0, 1, primitive.x], [0, 0, 1]])
-    variances = np.diag(jacobian @ frame_covariance @ jacobian.T).tolist()
+    position = np.array([[primitive.x, primitive.y, 0.0]])
+    variances = np.diag(frame_covariances(frame_covariance, position)[0]).tolist()
     added = dict(zip(("x", "y", "theta"), variances, strict=True))
     return {name: math.sqrt(value**2 + added.get(name, 0.0)) for name, value in std.items()}

@@ -26,7 +26,7 @@ from prim.log.writer import LogWriter
 from prim.scan import Scan
 from prim.se2 import Pose2D
 from replay.poses.laser_poses import ScanTimes
-from replay.poses.localize import Localizer
+from replay.poses.pose_provider import PoseProvider
 from replay.poses.transforms import TransformTree
 
 SECOND = 10**9
@@ -90,7 +90,7 @@ def pose_tuple(pose: Pose2D) -> tuple[float, float, float]:
 @pytest.mark.parametrize("source", ["auto", "tf"])
 def test_tf_chain_is_composed_and_interpolated(tmp_path: Path, source: str) -> None:
     with log_of(tmp_path / "a.mcap", MOUNT, transforms("/tf", *MOVING)) as log:
-        located = Localizer(log).locate(TIMES, source)
+        located = PoseProvider(log).laser_poses(TIMES, source)
     assert (located.source, located.origin) == ("tf", "odom > base_link > laser")
     assert located.valid.all()
     assert located.poses[1] == pytest.approx(pose_tuple(HALFWAY))
@@ -99,7 +99,7 @@ def test_tf_chain_is_composed_and_interpolated(tmp_path: Path, source: str) -> N
 def test_tf_chain_is_followed_to_map(tmp_path: Path) -> None:
     to_map = (0, "map", "odom", Pose2D(5, 0, 0))
     with log_of(tmp_path / "a.mcap", transforms("/tf_static", to_map), MOUNT_2, transforms("/tf", *MOVING)) as log:
-        located = Localizer(log).locate(TIMES)
+        located = PoseProvider(log).laser_poses(TIMES)
     assert located.origin == "map > odom > base_link > laser"
     assert located.poses[1, 0] == pytest.approx(HALFWAY.x + 5)
 
@@ -109,15 +109,15 @@ MOUNT_2 = transforms("/other/tf_static", (0, "base_link", "laser", Pose2D(0.1, 0
 
 def test_odometry_is_composed_with_the_mount_of_the_laser(tmp_path: Path) -> None:
     with log_of(tmp_path / "a.mcap", MOUNT, DRIVE) as log:
-        located = Localizer(log).locate(TIMES, "odom")
+        located = PoseProvider(log).laser_poses(TIMES, "odom")
         assert located.poses[1] == pytest.approx(pose_tuple(HALFWAY))
         assert located.notes == ()
 
 
 def test_unknown_mount_is_reported_and_can_be_given(tmp_path: Path) -> None:
     with log_of(tmp_path / "a.mcap", DRIVE) as log:
-        assert "no transform from base_link to laser" in Localizer(log).locate(TIMES).notes[0]
-        given = Localizer(log, laser_offset=Pose2D(0.1, 0.2, math.pi / 2)).locate(TIMES)
+        assert "no transform from base_link to laser" in PoseProvider(log).laser_poses(TIMES).notes[0]
+        given = PoseProvider(log, laser_offset=Pose2D(0.1, 0.2, math.pi / 2)).laser_poses(TIMES)
     assert given.notes == ()
     assert given.poses[1] == pytest.approx(pose_tuple(HALFWAY))
 
@@ -125,9 +125,9 @@ def test_unknown_mount_is_reported_and_can_be_given(tmp_path: Path) -> None:
 def test_auto_prefers_the_ground_truth(tmp_path: Path) -> None:
     true = truth((1, Pose2D(7, 0, 0)), (2, Pose2D(7, 0, 0)))
     with log_of(tmp_path / "a.mcap", MOUNT, DRIVE, transforms("/tf", *MOVING), true) as log:
-        localizer = Localizer(log)
-        sources = {source: localizer.locate(TIMES, source).source for source in ("auto", "truth", "tf", "odom")}
-        assert localizer.locate(TIMES).poses[0, 0] == pytest.approx(7.1)
+        provider = PoseProvider(log)
+        sources = {source: provider.laser_poses(TIMES, source).source for source in ("auto", "truth", "tf", "odom")}
+        assert provider.laser_poses(TIMES).poses[0, 0] == pytest.approx(7.1)
     assert sources == {"auto": "truth", "truth": "truth", "tf": "tf", "odom": "odom"}
 
 
@@ -138,7 +138,7 @@ def test_pose_stamped_is_used_where_there_is_no_odometry(tmp_path: Path) -> None
             log.write("/pose", second * SECOND, encode_pose(second * SECOND, Pose2D(second, 0, 0)))
 
     with log_of(tmp_path / "a.mcap", MOUNT, write) as log:
-        located = Localizer(log).locate(TIMES)
+        located = PoseProvider(log).laser_poses(TIMES)
     assert (located.source, located.origin) == ("odom", "/pose")
     assert located.poses[1, 0] == pytest.approx(1.6)
 
@@ -147,15 +147,15 @@ def test_several_topics_of_odometry_are_listed(tmp_path: Path) -> None:
     other = odometry("/wheels", (1, Pose2D(9, 0, 0)), (2, Pose2D(9, 0, 0)))
     with log_of(tmp_path / "a.mcap", DRIVE, other) as log:
         with pytest.raises(LogReadError, match=r"/odom, /wheels; choose one with --odom-topic"):
-            Localizer(log).locate(TIMES)
-        assert Localizer(log, odom_topic="/wheels").locate(TIMES).poses[0, 0] == 9
+            PoseProvider(log).laser_poses(TIMES)
+        assert PoseProvider(log, odom_topic="/wheels").laser_poses(TIMES).poses[0, 0] == 9
         with pytest.raises(LogReadError, match=r"no poses on /none; topics with poses: /odom"):
-            Localizer(log, odom_topic="/none").locate(TIMES)
+            PoseProvider(log, odom_topic="/none").laser_poses(TIMES)
 
 
 def test_scans_outside_the_time_of_the_poses_are_invalid(tmp_path: Path) -> None:
     with log_of(tmp_path / "a.mcap", MOUNT, odometry("/odom", (1.4, Pose2D()), (3, Pose2D()))) as log:
-        assert Localizer(log).locate(TIMES).valid.tolist() == [False, True, True]
+        assert PoseProvider(log).laser_poses(TIMES).valid.tolist() == [False, True, True]
 
 
 def test_poses_on_another_clock_are_an_error(tmp_path: Path) -> None:
@@ -163,7 +163,7 @@ def test_poses_on_another_clock_are_an_error(tmp_path: Path) -> None:
         log_of(tmp_path / "a.mcap", odometry("/odom", (1000, Pose2D()), (1001, Pose2D()))) as log,
         pytest.raises(LogReadError, match="two clocks"),
     ):
-        Localizer(log).locate(TIMES)
+        PoseProvider(log).laser_poses(TIMES)
 
 
 @pytest.mark.parametrize(
@@ -177,7 +177,7 @@ def test_poses_on_another_clock_are_an_error(tmp_path: Path) -> None:
 )
 def test_missing_poses_are_an_error(tmp_path: Path, source: str, message: str) -> None:
     with log_of(tmp_path / "a.mcap", MOUNT) as log, pytest.raises(LogReadError, match=message):
-        Localizer(log).locate(TIMES, source)
+        PoseProvider(log).laser_poses(TIMES, source)
 
 
 def raw_transform(parent: str, child: str, rotation: tuple[float, float, float, float]) -> Write:
@@ -204,7 +204,7 @@ def test_laser_mounted_upside_down_is_detected(tmp_path: Path) -> None:
     rolled = raw_transform("base_link", "laser", (1.0, 0.0, 0.0, 0.0))
     with log_of(tmp_path / "a.mcap", rolled, transforms("/tf", *MOVING), DRIVE) as log:
         for source in ("tf", "odom"):
-            located = Localizer(log).locate(TIMES, source)
+            located = PoseProvider(log).laser_poses(TIMES, source)
             assert located.upside_down
             assert located.poses[1] == pytest.approx((1, 0, math.pi / 4))
 
@@ -213,7 +213,7 @@ def test_tilted_laser_is_reported(tmp_path: Path) -> None:
     half = math.radians(30) / 2
     pitched = raw_transform("base_link", "laser", (0.0, math.sin(half), 0.0, math.cos(half)))
     with log_of(tmp_path / "a.mcap", pitched, DRIVE) as log:
-        assert "tilted by 30 degrees" in Localizer(log).locate(TIMES).notes[0]
+        assert "tilted by 30 degrees" in PoseProvider(log).laser_poses(TIMES).notes[0]
 
 
 def test_transform_with_a_rotation_of_zeros_is_left_out(tmp_path: Path) -> None:
