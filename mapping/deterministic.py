@@ -24,6 +24,7 @@ class DeterministicMapper:
     """
 
     name = "det"
+    counts_visits = False
     noise_std: float | None = None
 
     def __init__(self, resolution: float = 0.01, bounds: Bounds | None = None) -> None:
@@ -31,7 +32,7 @@ class DeterministicMapper:
 
         Args:
             resolution: Side of a cell (m).
-            bounds: X0, y0, x1, y1 (m) of the map; None: it grows with the scans.
+            bounds: (x0, y0, x1, y1) (m) of the map; None: it grows with the scans.
         """
         self.resolution = resolution
         self._cells = GrowingGrid(resolution, bounds, UNSEEN, np.uint8)

@@ -74,7 +74,7 @@ class GridFrame:
         """Return the smallest frame that covers bounds.
 
         Args:
-            bounds: X0, y0, x1, y1 (m).
+            bounds: (x0, y0, x1, y1) (m).
             resolution: Side of a cell (m).
 
         Returns:
@@ -187,7 +187,7 @@ class GrowingGrid:
 
         Args:
             resolution: Side of a cell (m).
-            bounds: X0, y0, x1, y1 (m); None: the array grows.
+            bounds: (x0, y0, x1, y1) (m); None: the array grows.
             fill: Value of new cells.
             dtype: The array's type.
             margin: A growing array extends at least this far (m) beyond what has been asked for.

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable, Mapping
 from typing import Protocol
 
 import numpy as np
@@ -19,9 +20,15 @@ from prim.world import Bounds
 
 
 class Mapper(Protocol):
-    """A mapper: builds an occupancy grid from scans taken at known poses."""
+    """A mapper: builds an occupancy grid from scans taken at known poses.
+
+    Attributes:
+        name: One of MAPPERS.
+        counts_visits: Whether its grids say how many rays reached each cell.
+    """
 
     name: str
+    counts_visits: bool
 
     @property
     def noise_std(self) -> float | None:
@@ -94,7 +101,7 @@ def make_mapper(
     Args:
         name: One of MAPPERS.
         resolution: Side of a cell (m).
-        bounds: X0, y0, x1, y1 (m) of the map; None: it grows with the scans.
+        bounds: (x0, y0, x1, y1) (m) of the map; None: it grows with the scans.
         sensor_model: One of SENSOR_MODELS; other than ``eq4`` for ``prob`` alone.
         noise_std: Standard deviation of the range noise (m): ``forward`` estimates it where it is not given, the
             ``gaussian`` sensor model needs it.
@@ -108,19 +115,23 @@ def make_mapper(
     check_mapper(name, sensor_model, noise_std)
     if sensor_model == "gaussian" and noise_std is None:
         raise UsageError("the Gaussian sensor model needs --noise-std")
-    warm_up = _make(name, 0.5, (-1.0, -1.0, 1.0, 1.0), noise_std)
+    make = _FACTORIES[name]
+    warm_up = make(0.5, (-1.0, -1.0, 1.0, 1.0), noise_std)
     warm_up.update(_WARM_UP_SCAN, Pose2D(0.1, 0.1))
     warm_up.grid()
     warm_up.finish()
-    return _make(name, resolution, bounds, noise_std)
+    return make(resolution, bounds, noise_std)
 
 
-def _make(name: str, resolution: float, bounds: Bounds | None, noise_std: float | None) -> Mapper:
-    if name == "forward":
-        return ForwardMapper(resolution, bounds, noise_std)
-    if name == "prob":
-        return ProbabilisticMapper(resolution, bounds, noise_std)
+def _make_deterministic(resolution: float, bounds: Bounds | None, noise_std: float | None) -> Mapper:
     return DeterministicMapper(resolution, bounds)
 
+
+_FACTORIES: Mapping[str, Callable[[float, Bounds | None, float | None], Mapper]] = {
+    MapperName.DET: _make_deterministic,
+    MapperName.PROB: ProbabilisticMapper,
+    MapperName.FORWARD: ForwardMapper,
+}
+"""How each mapper is made, of its resolution (m), bounds (m) and range noise (m)."""
 
 _WARM_UP_SCAN = Scan(0, "", 0.0, 2.0, 0.1, 1.0, np.array([0.7, -np.inf, np.inf], dtype=np.float32))

@@ -100,6 +100,7 @@ class ProbabilisticMapper:
     """
 
     name = "prob"
+    counts_visits = False
 
     def __init__(
         self,
@@ -112,7 +113,7 @@ class ProbabilisticMapper:
 
         Args:
             resolution: Side of a cell (m).
-            bounds: X0, y0, x1, y1 (m) of the map; None: it grows with the scans.
+            bounds: (x0, y0, x1, y1) (m) of the map; None: it grows with the scans.
             noise_std: Standard deviation (m) of the Gaussian sensor model; None: Eq. 4's model.
             options: The model's parameters.
         """

@@ -9,7 +9,7 @@ from enum import StrEnum
 
 
 class MapperName(StrEnum):
-    """The mappers: deterministic (``det``; no detection), probabilistic (``prob``), with a forward sensor model."""
+    """The mappers: deterministic, probabilistic, and the one with a forward sensor model."""
 
     DET = "det"
     PROB = "prob"

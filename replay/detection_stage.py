@@ -14,6 +14,7 @@ from detect.networks.weights import shipped_weights
 from mapping.grid import GridFrame, OccupancyGrid
 from mapping.mapper import Mapper, make_mapper
 from prim.arrays import FloatArray
+from prim.choices import MapperName
 from prim.errors import UsageError
 from prim.metrics import DetectionErrors, detection_errors
 from prim.scan import PosedScan, Scan
@@ -404,7 +405,7 @@ def _own_mapper(detector: Detector, options: ReplayOptions, frame: GridFrame) ->
     cell = detector.card.resolution
     if np.isclose(options.resolution, cell, rtol=1e-6) and options.sensor_model == "eq4":
         return None
-    noise_std = options.noise_std if options.mapper == "forward" else None
+    noise_std = options.noise_std if options.mapper == MapperName.FORWARD else None
     return make_mapper(options.mapper, cell, GridFrame.covering(frame.bounds, cell).bounds, "eq4", noise_std)
 
 

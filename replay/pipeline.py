@@ -11,7 +11,6 @@ from typing import NamedTuple
 
 from mapping.grid import GridFrame, OccupancyGrid
 from mapping.map_metrics import MapScores
-from prim.choices import MapperName
 from prim.errors import LogReadError, WorldError
 from prim.log import open_log
 from prim.log.source import LogSource
@@ -99,7 +98,7 @@ class Pipeline:
             evaluator = ReplayEvaluator(frame, truth, poses, true_poses)
             detection = self._make_detection_stage(frame, evaluator, poses)
             mapping = self._make_mapping_stage(frame, posed_scans, detection)
-            self._begin_viewer(frame, posed_scans, detection, evaluator)
+            self._begin_viewer(frame, posed_scans, mapping, detection, evaluator)
             for posed in self._paced(posed_scans):
                 seconds = mapping.update(posed)
                 evaluator.update(posed)
@@ -211,6 +210,7 @@ class Pipeline:
         self,
         frame: GridFrame,
         posed_scans: PosedScans,
+        mapping: MappingStage,
         detection: DetectionStage | NoDetection,
         evaluator: ReplayEvaluator,
     ) -> None:
@@ -223,7 +223,7 @@ class Pipeline:
             bounds=frame.bounds,
             has_scores=evaluator.scores_maps,
             has_pose_errors=evaluator.compares_poses,
-            has_visits=self.options.mapper == MapperName.FORWARD,
+            has_visits=mapping.mapper.counts_visits,
             has_detections=detects,
             has_errors=detects and evaluator.scores_maps,
         )

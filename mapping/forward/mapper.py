@@ -100,6 +100,7 @@ class ForwardMapper:
     """
 
     name = "forward"
+    counts_visits = True
 
     def __init__(
         self,
@@ -114,7 +115,7 @@ class ForwardMapper:
 
         Args:
             resolution: Side of a cell (m).
-            bounds: X0, y0, x1, y1 (m) of the map; None: it grows with the scans.
+            bounds: (x0, y0, x1, y1) (m) of the map; None: it grows with the scans.
             noise_std: Standard deviation of the range noise (m), held fixed; None: it is estimated.
             start_std: Its initial value (m) where it is estimated, bounded by what neighbouring beams show and by
                 ``max_start_ratio`` times that; None: what they show.
