@@ -14,7 +14,7 @@ demo: .venv/installed
 	$(BIN)/prim-record demo/session.mcap --seed $(SEED) --noise-std $(NOISE_STD)
 	cd demo && for mapper in det prob; do ../$(BIN)/prim-replay session.mcap --mapper $$mapper --quiet || exit 1; done
 	cd demo && ../$(BIN)/prim-replay session.mcap --mapper forward --detect-every 10
-	@echo "look from here: $(BIN)/rerun demo/session.forward.rrd"
+	@echo "open it: $(BIN)/rerun demo/session.forward.rrd"
 	@$(BIN)/python docs/screenshot.py demo/session.forward.rrd demo/session.forward.png; case $$? in \
 	  0) echo "picture: demo/session.forward.png" ;; \
 	  4) echo "no picture: this machine cannot render (apt-get install mesa-vulkan-drivers)" ;; \

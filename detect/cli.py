@@ -83,10 +83,10 @@ def _main(
 
 @train.command()
 def dataset(
-    folder: Annotated[Path, typer.Argument(metavar="FOLDER", help="Where the set is made, or gone on with.")],
-    preset: Annotated[
-        DatasetPreset, typer.Option(help="What it holds, where no other option says.")
-    ] = DatasetPreset.PAPER,
+    folder: Annotated[
+        Path, typer.Argument(metavar="FOLDER", help="The set's folder; an interrupted set is continued.")
+    ],
+    preset: Annotated[DatasetPreset, typer.Option(help="Defaults of all other options.")] = DatasetPreset.PAPER,
     maps: Annotated[
         tuple[int, int] | None, typer.Option(metavar="TRAIN VAL", help="Sessions to train on and to validate on.")
     ] = None,
@@ -96,13 +96,15 @@ def dataset(
         list[str] | None, typer.Option(metavar="KIND", help="A kind of primitive; repeat. [default: all]")
     ] = None,
     seed: Annotated[int | None, typer.Option(metavar="N", help="The first session's seed.")] = None,
-    workers: Annotated[int | None, typer.Option(metavar="N", help="Processes. [default: one a core]")] = None,
+    workers: Annotated[
+        int | None, typer.Option(metavar="N", help="Worker processes. [default: one per core]")
+    ] = None,
     quiet: Annotated[bool, typer.Option("--quiet", help="Print errors only.")] = False,
     debug: Annotated[bool, typer.Option("--debug", help="Show tracebacks.")] = False,
 ) -> int:
-    """Record sessions, map them with every mapper, and keep images, labels and exact primitives.
+    """Record sessions, map them with every mapper, and write images, labels and exact primitives.
 
-    A set that was interrupted goes on where it stopped; the same options make the same set.
+    An interrupted set is continued; the same options give the same set.
     """
     from detect.training.dataset import DATASET_PRESETS, make_dataset
 
@@ -127,7 +129,9 @@ def dataset(
 
 @train.command()
 def drawings(
-    folder: Annotated[Path, typer.Argument(metavar="FOLDER", help="Where the set is made, or gone on with.")],
+    folder: Annotated[
+        Path, typer.Argument(metavar="FOLDER", help="The set's folder; an interrupted set is continued.")
+    ],
     images: Annotated[
         tuple[int, int], typer.Option(metavar="TRAIN VAL", help="Drawings to train on and to validate on.")
     ] = (6000, 100),
@@ -135,7 +139,7 @@ def drawings(
     quiet: Annotated[bool, typer.Option("--quiet", help="Print errors only.")] = False,
     debug: Annotated[bool, typer.Option("--debug", help="Show tracebacks.")] = False,
 ) -> int:
-    """Draw primitives to begin training from, where no pretrained weights are at hand: maps of no world."""
+    """Draw primitives to pretrain on, where no pretrained weights are available: no maps of a world."""
     from detect.training.drawings import DrawingOptions, make_drawings
 
     with console.progress_bar("drawings", quiet) as progress:
@@ -148,23 +152,25 @@ def drawings(
 @train.command()
 def cnn(
     data: Annotated[Path, typer.Argument(metavar="SET", help="A set made by prim-train dataset.")],
-    output: Annotated[Path, typer.Argument(metavar="FOLDER", help="Where checkpoints go: cnn.MAPPER[.KIND].pt.")],
-    mapper: Annotated[MapperName, typer.Option(help="Whose maps to learn from.")] = MapperName.FORWARD,
-    kind: Annotated[str, typer.Option(metavar="KIND", help="The kind, or kinds, to read.")] = ALL,
-    preset: Annotated[CnnPreset, typer.Option(help="Ours, the paper's settings, or more of ours.")] = CnnPreset.PRIM,
-    epochs: Annotated[
-        int | None, typer.Option(metavar="N", help="Passes over the set. [default: the preset's]")
-    ] = None,
+    output: Annotated[
+        Path, typer.Argument(metavar="FOLDER", help="The folder of checkpoints: cnn.MAPPER[.KIND].pt.")
+    ],
+    mapper: Annotated[MapperName, typer.Option(help="The mapper whose maps are trained on.")] = MapperName.FORWARD,
+    kind: Annotated[str, typer.Option(metavar="KIND", help="The kind, or kinds, to train for.")] = ALL,
+    preset: Annotated[
+        CnnPreset, typer.Option(help="Settings: ours, the paper's, or further training of ours.")
+    ] = CnnPreset.PRIM,
+    epochs: Annotated[int | None, typer.Option(metavar="N", help="Training epochs. [default: the preset's]")] = None,
     start: Annotated[
-        Path | None, typer.Option(metavar="W", help="Weights to begin from: a checkpoint, or an exported .onnx.")
+        Path | None, typer.Option(metavar="W", help="Initial weights: a checkpoint, or an exported .onnx.")
     ] = None,
-    seed: Annotated[int, typer.Option(metavar="N", help="What the weights begin from.")] = 0,
+    seed: Annotated[int, typer.Option(metavar="N", help="Random seed of weights and augmentation.")] = 0,
     quiet: Annotated[bool, typer.Option("--quiet", help="Print errors only.")] = False,
     debug: Annotated[bool, typer.Option("--debug", help="Show tracebacks.")] = False,
 ) -> int:
-    """Train the networks that read a primitive's parameters from a crop. An interrupted run goes on.
+    """Train the networks that estimate a primitive's parameters from a crop. An interrupted run is continued.
 
-    Ours is one network for all kinds; the paper's are one for each.
+    Ours is one network for all kinds; the paper's are one for each kind.
     """
     require_training_extra()
     from detect.training.train import CNN_PRESETS, checkpoint_name, network_kinds, train_cnn
@@ -190,22 +196,20 @@ def cnn(
 @train.command()
 def yolo(
     data: Annotated[Path, typer.Argument(metavar="SET", help="A set made by prim-train dataset.")],
-    output: Annotated[Path, typer.Argument(metavar="FOLDER", help="Where ultralytics leaves its run.")],
-    mapper: Annotated[ImageSource, typer.Option(help="Whose maps to learn from.")] = ImageSource.FORWARD,
+    output: Annotated[Path, typer.Argument(metavar="FOLDER", help="The output folder of ultralytics.")],
+    mapper: Annotated[ImageSource, typer.Option(help="The mapper whose maps are trained on.")] = ImageSource.FORWARD,
     preset: Annotated[
-        YoloPreset, typer.Option(help="Ours, the paper's settings, one for drawings, or more of ours.")
+        YoloPreset, typer.Option(help="Settings: ours, the paper's, those for drawings, or further training of ours.")
     ] = YoloPreset.PRIM,
-    epochs: Annotated[
-        int | None, typer.Option(metavar="N", help="Passes over the set. [default: the preset's]")
-    ] = None,
+    epochs: Annotated[int | None, typer.Option(metavar="N", help="Training epochs. [default: the preset's]")] = None,
     start: Annotated[
-        Path | None, typer.Option(metavar="W", help="Weights to begin from: a .pt, or an exported .onnx.")
+        Path | None, typer.Option(metavar="W", help="Initial weights: a .pt, or an exported .onnx.")
     ] = None,
-    trust: Annotated[bool, typer.Option("--trust", help="A .pt is a pickle that can run code: run it.")] = False,
-    seed: Annotated[int, typer.Option(metavar="N", help="What the weights begin from.")] = 0,
+    trust: Annotated[bool, typer.Option("--trust", help="Load a .pt, which is a pickle that can run code.")] = False,
+    seed: Annotated[int, typer.Option(metavar="N", help="Random seed of weights and augmentation.")] = 0,
     debug: Annotated[bool, typer.Option("--debug", help="Show tracebacks.")] = False,
 ) -> int:
-    """Train YOLOv5 to find the primitives. An interrupted run goes on."""
+    """Train YOLOv5 to detect primitives. An interrupted run is continued."""
     require_training_extra()
     from detect.training.train import YOLO_PRESETS, train_yolo
 
@@ -226,18 +230,26 @@ class StageName(StrEnum):
 
 @train.command()
 def export(
-    weights: Annotated[Path, typer.Argument(metavar="W.pt", help="What prim-train yolo or prim-train cnn has left.")],
-    output: Annotated[Path, typer.Argument(metavar="OUT.onnx", help="The file to make.")],
-    stage: Annotated[StageName, typer.Option(help="What the weights are of.")],
-    mapper: Annotated[MapperName, typer.Option(help="Whose maps they were trained on.")] = MapperName.FORWARD,
+    weights: Annotated[
+        Path, typer.Argument(metavar="W.pt", help="Weights trained by prim-train yolo or prim-train cnn.")
+    ],
+    output: Annotated[Path, typer.Argument(metavar="OUT.onnx", help="The file to write.")],
+    stage: Annotated[StageName, typer.Option(help="The network that the weights are of.")],
+    mapper: Annotated[
+        MapperName, typer.Option(help="The mapper whose maps they were trained on.")
+    ] = MapperName.FORWARD,
     data: Annotated[
         Path | None,
-        typer.Option("--set", metavar="SET", help="The set YOLO was trained on: its thresholds are chosen there."),
+        typer.Option(
+            "--set", metavar="SET", help="The set that YOLO was trained on, on which its thresholds are chosen."
+        ),
     ] = None,
-    trust: Annotated[bool, typer.Option("--trust", help="YOLO's .pt is a pickle that can run code: run it.")] = False,
+    trust: Annotated[
+        bool, typer.Option("--trust", help="Load YOLO's .pt, which is a pickle that can run code.")
+    ] = False,
     debug: Annotated[bool, typer.Option("--debug", help="Show tracebacks.")] = False,
 ) -> int:
-    """Make an ONNX file with a model card of trained weights."""
+    """Export trained weights to ONNX, with a model card."""
     require_training_extra()
     from detect.training.dataset import image_style
     from detect.training.export import export_cnn, export_yolo
@@ -256,13 +268,13 @@ def export(
 
 @train.command(name="all")
 def train_everything(
-    work: Annotated[Path, typer.Argument(metavar="FOLDER", help="Where sets, training and weights are kept.")],
+    work: Annotated[Path, typer.Argument(metavar="FOLDER", help="The folder of sets, training runs and weights.")],
     mapper: Annotated[list[MapperName] | None, typer.Option(help="A mapper; repeat. [default: all]")] = None,
     debug: Annotated[bool, typer.Option("--debug", help="Show tracebacks.")] = False,
 ) -> int:
-    """Make the weights that come with prim, from nothing: FOLDER/weights/MAPPER.
+    """Train the weights that come with prim from scratch: FOLDER/weights/MAPPER.
 
-    Takes hours, and says how long each part took; an interrupted run goes on.
+    Takes hours and reports the duration of each part; an interrupted run is continued.
     """
     require_training_extra()
     from detect.training.recipe import train_all
@@ -284,25 +296,27 @@ class SuiteName(StrEnum):
 
 @evaluation.command()
 def _evaluate(
-    work: Annotated[Path, typer.Argument(metavar="FOLDER", help="Where sets, networks and results are kept.")],
-    suite: Annotated[SuiteName, typer.Option(help="What is measured.")] = SuiteName.PAPER,
+    work: Annotated[Path, typer.Argument(metavar="FOLDER", help="The folder of sets, networks and results.")],
+    suite: Annotated[SuiteName, typer.Option(help="What is evaluated.")] = SuiteName.PAPER,
     weights: Annotated[
         Path | None,
-        typer.Option(metavar="FOLDER", help="Of --suite shipped: weights, a folder a mapper. [default: prim's own]"),
+        typer.Option(
+            metavar="FOLDER", help="Of --suite shipped: weights, one folder per mapper. [default: prim's own]"
+        ),
     ] = None,
     so_far: Annotated[
-        bool, typer.Option("--so-far", help="Report what has been measured; measure and train nothing.")
+        bool, typer.Option("--so-far", help="Report existing results; evaluate and train nothing.")
     ] = False,
-    sessions: Annotated[int, typer.Option(metavar="N", help="Of --suite shipped: sessions a row.", min=1)] = 500,
+    sessions: Annotated[int, typer.Option(metavar="N", help="Of --suite shipped: sessions per row.", min=1)] = 500,
     mapper: Annotated[
         list[MapperName] | None, typer.Option(help="Of --suite shipped: a mapper; repeat. [default: all]")
     ] = None,
     recorded: Annotated[
         list[RecordingMode] | None,
-        typer.Option(help="Of --suite shipped: a way of recording; repeat. [default: all]"),
+        typer.Option(help="Of --suite shipped: a recording mode; repeat. [default: all]"),
     ] = None,
     output: Annotated[
-        Path | None, typer.Option(metavar="FOLDER", help="Where the report goes. [default: report, in FOLDER]")
+        Path | None, typer.Option(metavar="FOLDER", help="The report's folder. [default: report, in FOLDER]")
     ] = None,
     quiet: Annotated[bool, typer.Option("--quiet", help="Print errors only.")] = False,
     debug: Annotated[bool, typer.Option("--debug", help="Show tracebacks.")] = False,
@@ -310,11 +324,11 @@ def _evaluate(
         bool, typer.Option("--version", callback=_show_eval_version, is_eager=True, help="Print the version.")
     ] = False,
 ) -> int:
-    """Measure the detector. Sets are made where they are missing; an interrupted run goes on.
+    """Evaluate the detector. Missing sets are made; an interrupted run is continued.
 
-    paper: Tables I and II made again, networks trained as the paper does, its numbers beside ours (hours on two
-    cores); leaves paper.md, paper.csv, paper.png. shipped: weights, and what refinement makes of them, on fresh
-    sessions (--sessions, --mapper and --recorded choose; the report shows all that has been measured); leaves
+    paper: reproduces Tables I and II, with networks trained as in the paper, beside the paper's numbers (hours on two
+    cores); writes paper.md, paper.csv, paper.png. shipped: evaluates weights, without and with refinement, on fresh
+    sessions (selected by --sessions, --mapper and --recorded; the report shows all existing results); writes
     shipped.md, shipped.csv.
     """
 

@@ -62,7 +62,7 @@ def record(
     output: Annotated[Path, typer.Argument(metavar="OUT.mcap", help="The log to write.")],
     seed: Annotated[int, typer.Option(min=0, help="The same seed and options write the same bytes.")] = 0,
     world: Annotated[Path | None, typer.Option(help="Read the world from this JSON file.")] = None,
-    size: Annotated[tuple[float, float], typer.Option(metavar="X Y", help="The floor, metres.")] = SIZE,
+    size: Annotated[tuple[float, float], typer.Option(metavar="X Y", help="Size of the floor, metres.")] = SIZE,
     walls: Annotated[bool, typer.Option(help="A wall along each edge of the floor.")] = True,
     kinds: Annotated[str, typer.Option(help="Kinds of primitives to draw, with commas, or all.")] = ALL_KINDS,
     per_kind: Annotated[
@@ -71,7 +71,7 @@ def record(
     motion: Annotated[MotionName, typer.Option(help="How the robot moves.")] = MotionName.WARP,
     stops: Annotated[
         tuple[int, int] | None,
-        typer.Option(metavar="COLS ROWS", help="The grid of places it is warped to. [default: 10 10]"),
+        typer.Option(metavar="COLS ROWS", help="The grid of positions it is warped to. [default: 10 10]"),
     ] = None,
     duration: Annotated[
         float | None, typer.Option(metavar="S", help="How long it drives, seconds. [default: 60]")
@@ -82,7 +82,7 @@ def record(
     movable: Annotated[bool, typer.Option("--movable", help="A driving robot can push the primitives.")] = False,
     odom_noise: Annotated[
         tuple[float, float] | None,
-        typer.Option(metavar="M DEG", help="Odometry's std after a metre of driving. [default: 0.05 2]"),
+        typer.Option(metavar="M DEG", help="Noise (std) of odometry after one metre. [default: 0.05 2]"),
     ] = None,
     rate: Annotated[float, typer.Option(help="Scans per second.")] = 10.0,
     rays: Annotated[int, typer.Option(min=1, help="Beams in a scan.")] = 500,

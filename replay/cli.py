@@ -42,75 +42,79 @@ def _show_version(wanted: bool) -> None:
 @app.command()
 def replay(
     logs: Annotated[list[Path], typer.Argument(metavar="LOG...", help="MCAP logs, or folders of ROS 2 bags.")],
-    mapper: Annotated[MapperName, typer.Option(help="How the map is made.")] = MapperName.PROB,
-    pose: Annotated[PoseSourceName, typer.Option(help="Where poses come from.")] = PoseSourceName.AUTO,
+    mapper: Annotated[MapperName, typer.Option(help="The occupancy mapper.")] = MapperName.PROB,
+    pose: Annotated[PoseSourceName, typer.Option(help="The source of poses.")] = PoseSourceName.AUTO,
     resolution: Annotated[float, typer.Option(metavar="M", help="Side of a cell, metres.")] = 0.01,
     bounds: Annotated[str, typer.Option(metavar="auto or X0 Y0 X1 Y1", help="The map's bounds, metres.")] = "auto",
     scan_topic: Annotated[str | None, typer.Option(metavar="T", help="The topic of scans.")] = None,
     odom_topic: Annotated[str | None, typer.Option(metavar="T", help="The topic of poses.")] = None,
     fuse: Annotated[
         str | None,
-        typer.Option(metavar="odom,gps,compass", help="What poses are fused from. [default: all that is there]"),
+        typer.Option(metavar="odom,gps,compass", help="The sensors to fuse. [default: all available]"),
     ] = None,
     gps_topic: Annotated[str | None, typer.Option(metavar="T", help="The topic of position fixes.")] = None,
     compass_topic: Annotated[str | None, typer.Option(metavar="T", help="The topic of north vectors.")] = None,
     pose_noise: Annotated[
         tuple[float, float] | None,
-        typer.Option(metavar="M DEG", help="Noise (std) of GPS and compass. [default: found from the log]"),
+        typer.Option(
+            metavar="M DEG",
+            help="Noise (std) of GPS positions and compass headings. [default: estimated from the log]",
+        ),
     ] = None,
     odom_noise: Annotated[
         tuple[float, float] | None,
-        typer.Option(metavar="M DEG", help="Odometry's std after a metre of way. [default: found from the log]"),
+        typer.Option(
+            metavar="M DEG", help="Noise (std) of odometry after one metre. [default: estimated from the log]"
+        ),
     ] = None,
     match_scans: Annotated[
-        bool, typer.Option("--match-scans", help="Correct the poses by matching scans with a map of them all.")
+        bool, typer.Option("--match-scans", help="Correct the poses by scan matching, with a map of all scans.")
     ] = False,
     no_deskew: Annotated[
-        bool, typer.Option("--no-deskew", help="Take all beams of a scan as measured at its stamp.")
+        bool, typer.Option("--no-deskew", help="Treat all beams of a scan as measured at its stamp.")
     ] = False,
     start: Annotated[float | None, typer.Option(metavar="S", help="Begin S seconds into the log.")] = None,
     end: Annotated[float | None, typer.Option(metavar="S", help="End S seconds into the log.")] = None,
     duration: Annotated[float | None, typer.Option(metavar="S", help="Replay S seconds.")] = None,
     n_scans: Annotated[int | None, typer.Option(metavar="N", help="Replay N scans.")] = None,
     stride: Annotated[int, typer.Option(metavar="N", help="Replay every N-th scan.")] = 1,
-    rate: Annotated[
-        float | None, typer.Option(metavar="R", help="Hold the replay to R times the log's speed.")
-    ] = None,
+    rate: Annotated[float | None, typer.Option(metavar="R", help="Limit the replay to R times real time.")] = None,
     laser_offset: Annotated[
         tuple[float, float, float] | None,
-        typer.Option(metavar="X Y DEG", help="Where the laser is mounted on the robot."),
+        typer.Option(metavar="X Y DEG", help="Mounting pose of the laser on the robot, metres and degrees."),
     ] = None,
     max_range: Annotated[
         float | None,
         typer.Option(
-            metavar="M", help="Follow beams no further than this, metres. [default: the scanner's range_max]"
+            metavar="M", help="Trace beams no further than this, metres. [default: the scanner's range_max]"
         ),
     ] = None,
     sensor_model: Annotated[
-        SensorModelName, typer.Option(help="What prob makes of a range: the paper's Eq. 4, or a Gaussian.")
+        SensorModelName, typer.Option(help="Inverse sensor model of prob: the paper's Eq. 4, or a Gaussian.")
     ] = SensorModelName.EQ4,
     noise_std: Annotated[
         float | None,
         typer.Option(
-            metavar="M", help="Standard deviation of the ranges, metres. [default: found from the log, where needed]"
+            metavar="M",
+            help="Standard deviation of the range noise, metres. [default: estimated from the log, where needed]",
         ),
     ] = None,
     standing_still: Annotated[
-        bool, typer.Option("--standing-still", help="The robot does not move: map without poses.")
+        bool, typer.Option("--standing-still", help="Assume that the robot does not move: map without poses.")
     ] = False,
     map_every: Annotated[
         int | None, typer.Option(metavar="N", help="Show the map every N scans. [default: about 50 times]")
     ] = None,
-    no_detect: Annotated[bool, typer.Option("--no-detect", help="Look for no primitives.")] = False,
+    no_detect: Annotated[bool, typer.Option("--no-detect", help="Skip the detection of primitives.")] = False,
     detect_every: Annotated[
-        int | None, typer.Option(metavar="N", help="Look for primitives every N scans as well as at the end.")
+        int | None, typer.Option(metavar="N", help="Detect primitives every N scans as well as at the end.")
     ] = None,
     no_refine: Annotated[
-        bool, typer.Option("--no-refine", help="Leave primitives as the networks read them: no fit to the rays.")
+        bool, typer.Option("--no-refine", help="Keep the networks' estimates: no fit to the rays.")
     ] = False,
     weights: Annotated[
         Path | None,
-        typer.Option(metavar="W.onnx", help="The detector's YOLO, or its folder. [default: what comes with prim]"),
+        typer.Option(metavar="W.onnx", help="The detector's YOLO network, or its folder. [default: prim's own]"),
     ] = None,
     save: Annotated[Path | None, typer.Option(metavar="OUT.rrd", help="Save the rerun recording here.")] = None,
     spawn: Annotated[bool, typer.Option("--spawn", help="Open a rerun viewer and show the replay.")] = False,
@@ -119,24 +123,24 @@ def replay(
     ] = None,
     serve: Annotated[bool, typer.Option("--serve", help="Serve the replay to web browsers.")] = False,
     no_viewer: Annotated[bool, typer.Option("--no-viewer", help="Make no rerun recording.")] = False,
-    report: Annotated[Path | None, typer.Option(metavar="OUT.json", help="Where the report goes.")] = None,
+    report: Annotated[Path | None, typer.Option(metavar="OUT.json", help="Write the report here.")] = None,
     map_output: Annotated[
         Path | None, typer.Option("--map", metavar="OUT", help="Write OUT.pgm and OUT.yaml for nav2.")
     ] = None,
     trajectory: Annotated[
         Path | None, typer.Option(metavar="OUT.tum", help="Write the laser's poses in TUM's format.")
     ] = None,
-    recover: Annotated[bool, typer.Option("--recover", help="Read what is left of a damaged log.")] = False,
+    recover: Annotated[bool, typer.Option("--recover", help="Read what is intact of a damaged log.")] = False,
     quiet: Annotated[bool, typer.Option("--quiet", help="Print errors only.")] = False,
     verbose: Annotated[
-        bool, typer.Option("--verbose", help="Say where the time goes, and what was not taken for a primitive.")
+        bool, typer.Option("--verbose", help="Report stage timings, and rejected candidates with the reasons.")
     ] = False,
     debug: Annotated[bool, typer.Option("--debug", help="Show tracebacks.")] = False,
     version: Annotated[
         bool, typer.Option("--version", callback=_show_version, is_eager=True, help="Print the version.")
     ] = False,
 ) -> int:
-    """Replay MCAP logs of a 2D LiDAR through an occupancy mapper and look at the result in rerun.
+    """Replay MCAP logs of a 2D LiDAR through an occupancy mapper and show the result in rerun.
 
     Each log leaves a recording and a report in this folder: NAME.MAPPER.rrd and NAME.MAPPER.report.json.
     """
@@ -303,7 +307,7 @@ def _print_result(result: ReplayResult, outputs: OutputFiles, verbose: bool) -> 
     _print_table(result, verbose)
     typer.echo("wrote: " + ", ".join(str(path) for path in outputs.paths))
     if outputs.recording:
-        typer.echo(f"look:  rerun {outputs.recording}")
+        typer.echo(f"open:  rerun {outputs.recording}")
 
 
 def _print_rejected(result: ReplayResult) -> None:

@@ -23,7 +23,7 @@ UNITS = {ODOM: ("m", "rad"), GPS: ("m",), COMPASS: ("rad",)}
 SCHEMA = "prim-replay/1"
 
 MIN_REFINED_NOISE = 0.002
-"""The lower bound of the range noise (m) that refinement estimates, which the table calls «ray noise»."""
+"""The lower bound of the range noise (m) that refinement estimates, which the table shows beside the mapper's."""
 
 MIN_NOISE_CELLS = 1.5
 """The mapper's range noise, which the table calls «range noise», cannot be distinguished from the size of the cells
@@ -211,19 +211,18 @@ def _score_rows(scores: MapScores | None) -> Iterator[tuple[str, str]]:
 def _detection_rows(result: ReplayResult) -> Iterator[tuple[str, str]]:
     """Yield what was detected, and how it compares with the truth; or why detection was skipped.
 
-    «Ray noise» is the range noise that refinement estimated from the rays that meet primitives; «range noise» is that
-    of the mapper.
+    The range noise here is estimated by refinement, from the rays that meet primitives.
     """
     if result.detections is not None:
         yield "primitives", _kind_counts(result.detections)
         noise_std = result.detections.noise_std
         if noise_std is not None and result.options.noise_std is None:
             bound = "at most " if noise_std <= MIN_REFINED_NOISE else ""
-            yield "ray noise", f"{bound}{noise_std * 1000:.1f} mm (found on the primitives)"
+            yield "range noise", f"{bound}{noise_std * 1000:.1f} mm (estimated by refinement)"
         if result.detections.errors is not None:
             yield from _error_rows(result.detections.errors)
     if result.detection_skipped is not None:
-        yield "primitives", f"not looked for: {result.detection_skipped}"
+        yield "primitives", f"detection skipped: {result.detection_skipped}"
 
 
 def _time_row(result: ReplayResult) -> tuple[str, str]:
@@ -270,7 +269,7 @@ def _range_noise(std: float, given: bool, resolution: float) -> str:
         return f"{std * 1000:.1f} mm (as given)"
     if std < MIN_NOISE_CELLS * resolution:
         return f"at most {std * 1000:.1f} mm (cells of {resolution * 1000:g} mm show no less)"
-    return f"{std * 1000:.1f} mm (standard deviation)"
+    return f"{std * 1000:.1f} mm (estimated by the mapper)"
 
 
 def _percent(share: float | None) -> str:

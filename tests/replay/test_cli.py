@@ -45,7 +45,7 @@ def test_a_replay_writes_a_recording_and_a_report_by_default(
     code, out, err = replay(noisy_session.path, "--mapper", mapper)
     assert (code, err) == (0, "")
     assert {path.name for path in Path().iterdir()} == {f"noisy.{mapper}.rrd", f"noisy.{mapper}.report.json"}
-    assert out.splitlines()[-1] == f"look:  rerun noisy.{mapper}.rrd"
+    assert out.splitlines()[-1] == f"open:  rerun noisy.{mapper}.rrd"
     report = report_of(f"noisy.{mapper}.report.json")
     assert report["schema"] == "prim-replay/1"
     assert report["log"] == {

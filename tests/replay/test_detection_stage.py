@@ -176,9 +176,8 @@ def test_unusable_weights_are_refused_in_one_line(
 def test_the_table_names_missing_weights(noisy_session: Session, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("detect.networks.weights.SHIPPED", Path("nowhere"))
     result = Pipeline(noisy_session.path, ReplayOptions()).run()
-    assert (
-        "not looked for: no weights for maps of det" in dict(summary_rows(result))["primitives"] and not result.notes
-    )
+    assert "detection skipped: no weights for maps of det" in dict(summary_rows(result))["primitives"]
+    assert not result.notes
     with pytest.raises(UsageError, match="give --weights"):
         Pipeline(noisy_session.path, ReplayOptions(detect_every=3)).run()
 
@@ -190,7 +189,7 @@ def test_a_map_too_large_for_the_detector_skips_detection(
     monkeypatch.setattr("mapping.grid.MAX_CELLS", 10_000)
     monkeypatch.setattr("replay.detection_stage.shipped_weights", lambda mapper: Path("w"))
     result = Pipeline(noisy_session.path, ReplayOptions(resolution=0.05)).run()
-    assert dict(summary_rows(result))["primitives"].startswith("not looked for: a map of")
+    assert dict(summary_rows(result))["primitives"].startswith("detection skipped: a map of")
 
 
 def test_nothing_is_evaluated_where_poses_are_in_no_known_frame(
