@@ -91,9 +91,9 @@ def dataset(
         tuple[int, int] | None, typer.Option(metavar="TRAIN VAL", help="Sessions to train on and to validate on.")
     ] = None,
     noise_std: Annotated[list[float] | None, typer.Option(metavar="M", help="Range noise, metres; repeat.")] = None,
-    mapper: Annotated[list[MapperName] | None, typer.Option(help="A mapper; repeat. [default: all]")] = None,
+    mapper: Annotated[list[MapperName] | None, typer.Option(help="A mapper; may be repeated. [default: all]")] = None,
     kind: Annotated[
-        list[str] | None, typer.Option(metavar="KIND", help="A kind of primitive; repeat. [default: all]")
+        list[str] | None, typer.Option(metavar="KIND", help="A kind of primitive; may be repeated. [default: all]")
     ] = None,
     seed: Annotated[int | None, typer.Option(metavar="N", help="The first session's seed.")] = None,
     workers: Annotated[
@@ -102,9 +102,10 @@ def dataset(
     quiet: Annotated[bool, typer.Option("--quiet", help="Print errors only.")] = False,
     debug: Annotated[bool, typer.Option("--debug", help="Show tracebacks.")] = False,
 ) -> int:
-    """Record sessions, map them with every mapper, and write images, labels and exact primitives.
+    """Record and map sessions to train on.
 
-    An interrupted set is continued; the same options give the same set.
+    Writes images of every mapper's maps, labels and exact primitives. An interrupted set is continued; the same
+    options give the same set.
     """
     from detect.training.dataset import DATASET_PRESETS, make_dataset
 
@@ -139,7 +140,10 @@ def drawings(
     quiet: Annotated[bool, typer.Option("--quiet", help="Print errors only.")] = False,
     debug: Annotated[bool, typer.Option("--debug", help="Show tracebacks.")] = False,
 ) -> int:
-    """Draw primitives to pretrain on, where no pretrained weights are available: no maps of a world."""
+    """Draw synthetic outlines to pretrain on.
+
+    They take the place of pretrained weights; no sensor is simulated.
+    """
     from detect.training.drawings import DrawingOptions, make_drawings
 
     with console.progress_bar("drawings", quiet) as progress:
@@ -168,8 +172,9 @@ def cnn(
     quiet: Annotated[bool, typer.Option("--quiet", help="Print errors only.")] = False,
     debug: Annotated[bool, typer.Option("--debug", help="Show tracebacks.")] = False,
 ) -> int:
-    """Train the networks that estimate a primitive's parameters from a crop. An interrupted run is continued.
+    """Train the networks that estimate parameters.
 
+    They estimate a primitive's position, angle and sizes from a crop of the map. An interrupted run is continued.
     Ours is one network for all kinds; the paper's are one for each kind.
     """
     require_training_extra()
@@ -209,7 +214,10 @@ def yolo(
     seed: Annotated[int, typer.Option(metavar="N", help="Random seed of weights and augmentation.")] = 0,
     debug: Annotated[bool, typer.Option("--debug", help="Show tracebacks.")] = False,
 ) -> int:
-    """Train YOLOv5 to detect primitives. An interrupted run is continued."""
+    """Train YOLOv5 to detect primitives.
+
+    An interrupted run is continued.
+    """
     require_training_extra()
     from detect.training.train import YOLO_PRESETS, train_yolo
 
@@ -269,12 +277,13 @@ def export(
 @train.command(name="all")
 def train_everything(
     work: Annotated[Path, typer.Argument(metavar="FOLDER", help="The folder of sets, training runs and weights.")],
-    mapper: Annotated[list[MapperName] | None, typer.Option(help="A mapper; repeat. [default: all]")] = None,
+    mapper: Annotated[list[MapperName] | None, typer.Option(help="A mapper; may be repeated. [default: all]")] = None,
     debug: Annotated[bool, typer.Option("--debug", help="Show tracebacks.")] = False,
 ) -> int:
-    """Train the weights that come with prim from scratch: FOLDER/weights/MAPPER.
+    """Train weights like those that come with prim.
 
-    Takes hours and reports the duration of each part; an interrupted run is continued.
+    Trains from scratch and writes FOLDER/weights/MAPPER. Takes hours and reports the duration of each part; an
+    interrupted run is continued.
     """
     require_training_extra()
     from detect.training.recipe import train_all
@@ -309,11 +318,11 @@ def _evaluate(
     ] = False,
     sessions: Annotated[int, typer.Option(metavar="N", help="Of --suite shipped: sessions per row.", min=1)] = 500,
     mapper: Annotated[
-        list[MapperName] | None, typer.Option(help="Of --suite shipped: a mapper; repeat. [default: all]")
+        list[MapperName] | None, typer.Option(help="Of --suite shipped: a mapper; may be repeated. [default: all]")
     ] = None,
     recorded: Annotated[
         list[RecordingMode] | None,
-        typer.Option(help="Of --suite shipped: a recording mode; repeat. [default: all]"),
+        typer.Option(help="Of --suite shipped: a recording mode; may be repeated. [default: all]"),
     ] = None,
     output: Annotated[
         Path | None, typer.Option(metavar="FOLDER", help="The report's folder. [default: report, in FOLDER]")
@@ -324,12 +333,12 @@ def _evaluate(
         bool, typer.Option("--version", callback=_show_eval_version, is_eager=True, help="Print the version.")
     ] = False,
 ) -> int:
-    """Evaluate the detector. Missing sets are made; an interrupted run is continued.
+    """Evaluate the detector; the default suite takes hours.
 
-    paper: reproduces Tables I and II, with networks trained as in the paper, beside the paper's numbers (hours on two
-    cores); writes paper.md, paper.csv, paper.png. shipped: evaluates weights, without and with refinement, on fresh
-    sessions (selected by --sessions, --mapper and --recorded; the report shows all existing results); writes
-    shipped.md, shipped.csv.
+    Missing sets are made, and an interrupted run is continued. paper: reproduces Tables I and II, with networks
+    trained as in the paper, beside the paper's numbers; writes paper.md, paper.csv, paper.png. shipped: evaluates
+    weights, without and with refinement, on fresh sessions (selected by --sessions, --mapper and --recorded; the
+    report shows all existing results); writes shipped.md, shipped.csv.
     """
 
     def announce(text: str) -> None:

@@ -60,18 +60,22 @@ def _show_version(wanted: bool) -> None:
 @app.command()
 def record(
     output: Annotated[Path, typer.Argument(metavar="OUT.mcap", help="The log to write.")],
-    seed: Annotated[int, typer.Option(min=0, help="The same seed and options write the same bytes.")] = 0,
-    world: Annotated[Path | None, typer.Option(help="Read the world from this JSON file.")] = None,
+    seed: Annotated[
+        int, typer.Option(metavar="N", min=0, help="The same seed and options write the same bytes.")
+    ] = 0,
+    world: Annotated[Path | None, typer.Option(metavar="WORLD.json", help="Read the world from this file.")] = None,
     size: Annotated[tuple[float, float], typer.Option(metavar="X Y", help="Size of the floor, metres.")] = SIZE,
     walls: Annotated[bool, typer.Option(help="A wall along each edge of the floor.")] = True,
-    kinds: Annotated[str, typer.Option(help="Kinds of primitives to draw, with commas, or all.")] = ALL_KINDS,
+    kinds: Annotated[str, typer.Option(metavar="KIND,...", help="Kinds of primitives to draw, or all.")] = ALL_KINDS,
     per_kind: Annotated[
         str, typer.Option(metavar="N or A-B", help="How many of each kind: a number or a range.")
     ] = PER_KIND,
-    motion: Annotated[MotionName, typer.Option(help="How the robot moves.")] = MotionName.WARP,
+    motion: Annotated[
+        MotionName, typer.Option(help="The robot is set on a grid of positions, or drives.")
+    ] = MotionName.WARP,
     stops: Annotated[
         tuple[int, int] | None,
-        typer.Option(metavar="COLS ROWS", help="The grid of positions it is warped to. [default: 10 10]"),
+        typer.Option(metavar="COLS ROWS", help="The grid of positions of --motion warp. [default: 10 10]"),
     ] = None,
     duration: Annotated[
         float | None, typer.Option(metavar="S", help="How long it drives, seconds. [default: 60]")
@@ -84,19 +88,22 @@ def record(
         tuple[float, float] | None,
         typer.Option(metavar="M DEG", help="Noise (std) of odometry after one metre. [default: 0.05 2]"),
     ] = None,
-    rate: Annotated[float, typer.Option(help="Scans per second.")] = 10.0,
-    rays: Annotated[int, typer.Option(min=1, help="Beams in a scan.")] = 500,
-    fov: Annotated[float, typer.Option(help="Field of view, degrees.")] = FOV_DEGREES,
-    range_min: Annotated[float, typer.Option(help="Shortest range, metres.")] = 0.032,
-    range_max: Annotated[float, typer.Option(help="Longest range, metres.")] = 5.0,
+    rate: Annotated[float, typer.Option(metavar="HZ", help="Scans per second.")] = 10.0,
+    rays: Annotated[int, typer.Option(metavar="N", min=1, help="Beams in a scan.")] = 500,
+    fov: Annotated[float, typer.Option(metavar="DEG", help="Field of view, degrees.")] = FOV_DEGREES,
+    range_min: Annotated[float, typer.Option(metavar="M", help="Shortest range, metres.")] = 0.032,
+    range_max: Annotated[float, typer.Option(metavar="M", help="Longest range, metres.")] = 5.0,
     noise: Annotated[
-        float | None, typer.Option(help="LiDAR noise in the paper's unit: 0.05 is a std of 0.25 m.")
+        float | None, typer.Option(metavar="F", help="LiDAR noise (std) as a share of 5 m, the paper's unit.")
     ] = None,
     noise_std: Annotated[
-        float | None, typer.Option(help="LiDAR noise, std in metres. [default: 0.05]", show_default=False)
+        float | None,
+        typer.Option(
+            metavar="M", help="LiDAR noise (std), metres; excludes --noise. [default: 0.05]", show_default=False
+        ),
     ] = None,
-    gps_noise: Annotated[float, typer.Option(help="GPS noise, std in metres.")] = 0.1,
-    compass_noise: Annotated[float, typer.Option(help="Compass noise, std in degrees.")] = 3.0,
+    gps_noise: Annotated[float, typer.Option(metavar="M", help="GPS noise (std), metres.")] = 0.1,
+    compass_noise: Annotated[float, typer.Option(metavar="DEG", help="Compass noise (std), degrees.")] = 3.0,
     quiet: Annotated[bool, typer.Option("--quiet", help="Print nothing.")] = False,
     debug: Annotated[bool, typer.Option("--debug", help="Show tracebacks.")] = False,
     version: Annotated[

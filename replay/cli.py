@@ -42,18 +42,22 @@ def _show_version(wanted: bool) -> None:
 @app.command()
 def replay(
     logs: Annotated[list[Path], typer.Argument(metavar="LOG...", help="MCAP logs, or folders of ROS 2 bags.")],
-    mapper: Annotated[MapperName, typer.Option(help="The occupancy mapper.")] = MapperName.PROB,
+    mapper: Annotated[
+        MapperName, typer.Option(help="Deterministic, probabilistic (log-odds), or forward (maximum likelihood).")
+    ] = MapperName.PROB,
     pose: Annotated[PoseSourceName, typer.Option(help="The source of poses.")] = PoseSourceName.AUTO,
     resolution: Annotated[float, typer.Option(metavar="M", help="Side of a cell, metres.")] = 0.01,
     bounds: Annotated[str, typer.Option(metavar="auto or X0 Y0 X1 Y1", help="The map's bounds, metres.")] = "auto",
     scan_topic: Annotated[str | None, typer.Option(metavar="T", help="The topic of scans.")] = None,
-    odom_topic: Annotated[str | None, typer.Option(metavar="T", help="The topic of poses.")] = None,
+    odom_topic: Annotated[str | None, typer.Option(metavar="T", help="The topic of odometry or poses.")] = None,
     fuse: Annotated[
         str | None,
         typer.Option(metavar="odom,gps,compass", help="The sensors to fuse. [default: all available]"),
     ] = None,
     gps_topic: Annotated[str | None, typer.Option(metavar="T", help="The topic of position fixes.")] = None,
-    compass_topic: Annotated[str | None, typer.Option(metavar="T", help="The topic of north vectors.")] = None,
+    compass_topic: Annotated[
+        str | None, typer.Option(metavar="T", help="The topic of vectors that point north.")
+    ] = None,
     pose_noise: Annotated[
         tuple[float, float] | None,
         typer.Option(
@@ -142,7 +146,7 @@ def replay(
 ) -> int:
     """Replay MCAP logs of a 2D LiDAR through an occupancy mapper and show the result in rerun.
 
-    Each log leaves a recording and a report in this folder: NAME.MAPPER.rrd and NAME.MAPPER.report.json.
+    Each log leaves a recording and a report in this folder: LOG.MAPPER.rrd and LOG.MAPPER.report.json.
     """
     from replay.options import ReplayOptions
     from replay.selection import Selection

@@ -21,7 +21,7 @@ from replay.posed_scans import PosedScans
 from replay.timing import StageTimer
 
 WORLD_MARGIN = 0.1
-"""Automatic bounds reach this far (m) beyond the recorded world (DESIGN, section 5)."""
+"""Automatic bounds reach this far (m) beyond the recorded world."""
 
 NOISE_SCANS = 200
 """Where only the range noise is wanted, it is estimated from about this many scans, evenly spread; set by hand."""

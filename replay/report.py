@@ -117,9 +117,9 @@ def _primitives(result: DetectionResult | None) -> list[dict[str, Any]]:
     ]
 
 
-def _by_name(chances: Mapping[Kind, float] | None) -> dict[str, float] | None:
+def _by_name(kind_probabilities: Mapping[Kind, float] | None) -> dict[str, float] | None:
     """Return the probabilities of the kinds by name; None where they are not known."""
-    return None if chances is None else {str(kind): chance for kind, chance in chances.items()}
+    return None if kind_probabilities is None else {str(kind): chance for kind, chance in kind_probabilities.items()}
 
 
 def _errors(result: DetectionResult | None) -> dict[str, Any] | None:

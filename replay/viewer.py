@@ -424,7 +424,7 @@ def _map_view(scene: Scene) -> Any:
     view = from_above("map", f"Map ({scene.mapper}), from above")
     if not scene.has_visits:
         return view
-    return rrb.Tabs(view, from_above("evidence", "Evidence: rays per cell"), active_tab=0)
+    return rrb.Tabs(view, from_above("evidence", "Visits: rays per cell"), active_tab=0)
 
 
 def _result_view(scene: Scene) -> Any:

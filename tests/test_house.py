@@ -52,7 +52,7 @@ ENDS = {
 """Arrows that lead to these files of a folder alone."""
 
 TRAINING = {"torch", "torchvision", "ultralytics"}
-MAY_TRAIN = ("detect/training/", "detect/evaluation/")
+MAY_TRAIN = ("detect/training/",)
 
 SOURCES = sorted(path for part in PARTS for path in (ROOT / part).glob("**/*.py"))
 OUTSIDE = sorted(path for part in ("bench", "docs") for path in (ROOT / part).glob("*.py"))

@@ -63,8 +63,8 @@ for seed in range(3):
     results = Refinement(MapCells.of(mapped(taken))).run([disturbed(p, rng) for p in world.primitives], taken)
     for made, true in zip(results, world.primitives):
         assert made is not None and made.primitive.kind is true.kind, (made, true)
-        assert max(made.chances, key=made.chances.get) is true.kind and made.score > 0.9, made.chances
-        assert set(made.chances) == set(Kind) and set(made.std) == set(true.kind.parameters)
+        assert made.score == max(made.kind_probabilities.values()) > 0.9, made.kind_probabilities
+        assert set(made.kind_probabilities) == set(Kind) and set(made.std) == set(true.kind.parameters)
         found = made.primitive
         position = math.hypot(found.x - true.x, found.y - true.y)
         errors[true.kind].append((position, abs(found.size[0] - true.size[0]), angle_error(found, true)))

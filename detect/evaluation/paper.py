@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from prim.shapes import Kind
+
 
 @dataclass(frozen=True)
 class PaperRow:
@@ -32,6 +34,10 @@ ROWS = (
 )
 
 SHAPES = ("all", "square", "rectangle", "triangle", "circle", "ellipse")
+"""What the tables have rows for: sessions of all kinds, and of one kind each."""
+
+PAPER_KINDS = tuple(kind for kind in Kind if kind in SHAPES)
+"""The paper's kinds."""
 
 TEST_IMAGES = 125
 """Number of test images; the tables' inference times are of all of them."""

@@ -22,7 +22,7 @@ from typing import Any
 from detect.detector import Detector
 from detect.evaluation.evaluate import evaluate_detector
 from detect.evaluation.modes import RecordingMode
-from detect.evaluation.paper import ROWS, PaperRow
+from detect.evaluation.paper import PAPER_KINDS, ROWS, PaperRow
 from detect.evaluation.sessions import evaluate_sessions
 from detect.networks.parameters import PAPER
 from detect.networks.weights import DETECTOR_FILE
@@ -82,7 +82,7 @@ class Case:
     @property
     def single_kinds(self) -> tuple[Kind, ...]:
         """The kinds it is tested on alone too: all where training and test have the same noise, else none."""
-        return tuple(Kind) if self.train_mm == self.test_mm else ()
+        return PAPER_KINDS if self.train_mm == self.test_mm else ()
 
     def single_kind_set(self, kind: Kind) -> str:
         """Return the name of its test set with one kind."""
@@ -122,7 +122,7 @@ class PaperSuite:
             whole = read_result(self.result_path(case, case.test_set))
             if whole is not None:
                 by_kind = {kind.value: value for kind, value in single.items() if value is not None}
-                found.append((case, whole, by_kind if len(by_kind) == len(Kind) else {}))
+                found.append((case, whole, by_kind if len(by_kind) == len(PAPER_KINDS) else {}))
         if not found:
             raise UsageError(f"nothing has been measured in {self.work} yet")
         return found

@@ -1,1 +1,1 @@
-"""From a guess and the log's rays to the primitive, its covariance and the chances of its kinds."""
+"""From a guess and the log's rays to the primitive, its covariance and the posterior probabilities of its kinds."""

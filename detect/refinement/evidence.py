@@ -287,14 +287,14 @@ class Posterior:
         primitive: The likeliest kind at its posterior mean.
         std: Standard deviations (m, rad) by parameter name.
         covariance: (K, K) in the same order.
-        chances: Posterior probabilities of all kinds; they sum to 1.
+        kind_probabilities: Posterior probabilities of all kinds; they sum to 1.
         cost: Negative log-likelihood of the primitive (nats), by :class:`SplitCost`.
     """
 
     primitive: Primitive
     std: Mapping[str, float]
     covariance: FloatArray
-    chances: Mapping[Kind, float]
+    kind_probabilities: Mapping[Kind, float]
     cost: float
 
 
@@ -336,9 +336,9 @@ def compare_kinds(
         kind: math.exp(sampled[kind].log_evidence - highest if kind in sampled else rough[kind] - top)
         for kind in rough
     }
-    chances = {kind: weights.get(kind, 0.0) / sum(weights.values()) for kind in Kind}
+    kind_probabilities = {kind: weights.get(kind, 0.0) / sum(weights.values()) for kind in Kind}
     primitive, std, covariance = summarize(best, sampled[best])
-    return Posterior(primitive, std, covariance, chances, sampled[best].cost)
+    return Posterior(primitive, std, covariance, kind_probabilities, sampled[best].cost)
 
 
 def _merged_special_cases(

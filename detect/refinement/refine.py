@@ -49,7 +49,7 @@ class RefinedPrimitive:
         primitive: The likeliest kind at its posterior mean.
         std: Standard deviations (m, rad) by name: x, y, theta and the sizes.
         covariance: (K, K) in the same order.
-        chances: Posterior probabilities of the kinds.
+        kind_probabilities: Posterior probabilities of the kinds.
         log_ratio: Log-likelihood ratio of the rays against nothing in its place (nats).
         misfit: By how much the map alone explains the rays that meet it better (nats a ray).
         rays: How many rays meet it.
@@ -59,7 +59,7 @@ class RefinedPrimitive:
     primitive: Primitive
     std: Mapping[str, float]
     covariance: FloatArray
-    chances: Mapping[Kind, float]
+    kind_probabilities: Mapping[Kind, float]
     log_ratio: float
     misfit: float
     rays: int
@@ -68,7 +68,7 @@ class RefinedPrimitive:
     @property
     def score(self) -> float:
         """The posterior probability of its kind."""
-        return self.chances[self.primitive.kind]
+        return self.kind_probabilities[self.primitive.kind]
 
 
 @dataclass(frozen=True)
@@ -263,7 +263,7 @@ def _rejection(guess: Detection, result: RefinedPrimitive | None, reason: str) -
 def _detection(result: RefinedPrimitive, crop: NDArray[np.uint8]) -> Detection:
     outline = result.primitive.outline()
     (x0, y0), (x1, y1) = outline.min(axis=0).tolist(), outline.max(axis=0).tolist()
-    return Detection(result.primitive, result.score, (x0, y0, x1, y1), crop, result.std, result.chances)
+    return Detection(result.primitive, result.score, (x0, y0, x1, y1), crop, result.std, result.kind_probabilities)
 
 
 @dataclass
@@ -422,12 +422,12 @@ def finish(candidate: Candidate, map_alone: Background, sensor: BeamModel) -> Re
     ratio = float(-bundle.rays[BACKGROUND].sum() - posterior.cost)
     sectors = candidate.options.acceptance.sectors
     misfit, rays, seen = _compare_with_map(posterior.primitive, bundle, map_alone, sensor, sectors)
-    chances = candidate.known.kind_probabilities if candidate.known is not None else None
+    kind_probabilities = candidate.known.kind_probabilities if candidate.known is not None else None
     return RefinedPrimitive(
         posterior.primitive,
         posterior.std,
         posterior.covariance,
-        chances or posterior.chances,
+        kind_probabilities or posterior.kind_probabilities,
         ratio,
         misfit,
         rays,

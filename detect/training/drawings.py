@@ -168,7 +168,7 @@ def _draw_size(kind: Kind, rng: np.random.Generator) -> tuple[float, ...]:
     """Draw sizes (m) by rejection: of no special case of the kind, not too flat, not too long."""
     low, high = SIZE_RANGE
     if kind.is_tied:
-        return (float(rng.uniform(*(RADIUS_RANGE if kind.is_round else SIZE_RANGE))),)
+        return (float(rng.uniform(*RADIUS_RANGE) if kind.is_round else rng.uniform(*SIZE_RANGE) / kind.extent),)
     while True:
         a, b = (float(value) for value in rng.uniform(low, high, 2))
         if kind.longer_first:

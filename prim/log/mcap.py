@@ -31,14 +31,6 @@ MAGIC = b"\x89MCAP0\r\n"
 FOOTER_BYTES = 1 + 8 + 8 + 8 + 4 + len(MAGIC)
 """A file's end: the footer record (opcode, length, summary start, summary offset start, CRC) and the magic."""
 
-_OTHER_FORMATS = (
-    (b"#ROSBAG", "a ROS 1 bag", "convert it with: rosbags-convert --dst-storage mcap"),
-    (b"SQLite format 3", "a ROS 2 bag in SQLite", "convert it with: rosbags-convert --dst-storage mcap"),
-    (b"\x89PNG", "a PNG image", "give an .mcap log"),
-    (b"RRF2", "a rerun recording", "open it with: rerun FILE"),
-)
-"""First bytes of files that are no MCAP logs, what they are, and what to do."""
-
 _RECORD = struct.Struct("<BQ")
 """The prefix of every record: opcode and length."""
 _MESSAGE = struct.Struct("<HIQQ")
@@ -62,19 +54,19 @@ class McapReader:
     by the index of chunks where that is intact and else in file order.
 
     Args:
-        path: The file, or a folder with one in it.
+        path: The file, which begins with MAGIC (:func:`prim.log.open_log` has looked).
         recover: Pass over damage, and collect it in :attr:`lost`.
 
     Raises:
-        LogReadError: The file cannot be read, is damaged (unless ``recover``), or is no MCAP log.
+        LogReadError: The file cannot be read or is damaged (unless ``recover``).
     """
 
     def __init__(self, path: Path, recover: bool = False) -> None:
-        self.path = _resolved(path)
+        self.path = path
         self.lost: list[str] = []
         self._recover = recover
         self._undecodable: set[tuple[str, int]] = set()
-        self._file: IO[bytes] = _open(self.path)
+        self._file: IO[bytes] = path.open("rb")
         self._records = RecordReader(self._file, self.path, recover)
         self._index = SeekingReader(self._file, validate_crcs=True, record_size_limit=RECORD_LIMIT)
         try:
@@ -288,42 +280,10 @@ class McapReader:
         return self._records.indexed(self._summary.chunk_indexes, lost)
 
 
-def _resolved(path: Path) -> Path:
-    """Return the log's file: ``path`` itself, or the one .mcap file in the folder ``path`` (a ROS 2 bag)."""
-    if not path.is_dir():
-        return path
-    logs = sorted(path.glob("*.mcap"))
-    if len(logs) == 1:
-        return logs[0]
-    if logs:
-        names = ", ".join(log.name for log in logs)
-        raise LogReadError(path, f"a folder with {len(logs)} logs ({names})", "give one of them")
-    raise LogReadError(path, "a folder without an .mcap log in it", "give an .mcap file or a ROS 2 bag's folder")
-
-
 def _ros2_name(name: str) -> str:
     """Return the ROS 2 name of a message type: of ROS 1's package/Type, package/msg/Type."""
     parts = name.split("/")
     return f"{parts[0]}/msg/{parts[1]}" if len(parts) == 2 else name
-
-
-def _open(path: Path) -> IO[bytes]:
-    """Open a file that begins like an MCAP log. Raises LogReadError."""
-    try:
-        stream = path.open("rb")
-    except OSError as error:
-        raise LogReadError(path, f"cannot open: {error.strerror}") from error
-    start = stream.read(max(len(magic) for magic, _, _ in _OTHER_FORMATS))
-    if start.startswith(MAGIC):
-        stream.seek(0)
-        return stream
-    stream.close()
-    if not start:
-        raise LogReadError(path, "an empty file (0 bytes)", "give an .mcap log")
-    for magic, what, hint in _OTHER_FORMATS:
-        if start.startswith(magic):
-            raise LogReadError(path, f"{what}, not an MCAP log", hint)
-    raise LogReadError(path, "not an MCAP log: it begins with other bytes", "give an .mcap log")
 
 
 Record = TypeVar("Record", Metadata, Attachment)

@@ -58,7 +58,7 @@ def uncertainty_bounds(primitive: Primitive, std: Mapping[str, float]) -> Iterat
         The smaller primitive, then the larger one.
     """
     position_std = math.sqrt((std["x"] ** 2 + std["y"] ** 2) / 2)
-    half = 1.0 if primitive.is_round else 0.5
+    half = primitive.kind.extent / 2
     for sign in (-1, 1):
         sizes = tuple(
             max(size + sign * math.hypot(half * std[name], position_std) / half, MIN_SIZE)

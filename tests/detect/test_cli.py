@@ -12,6 +12,7 @@ from detect import cli
 from detect.networks.tiles import TILE_SIZE
 from detect.networks.weights import SHIPPED, load_weights
 from prim import console
+from prim.choices import MapperName
 
 Run = Callable[..., tuple[int, str, str]]
 
@@ -49,6 +50,10 @@ def test_a_data_set_is_made_and_continued(run: Run) -> None:
 def test_impossible_options(run: Run, arguments: list[str], said: str) -> None:
     code, _, err = run(*arguments)
     assert code == 2 and said in err and err.count("\n") == 1
+
+
+def test_yolo_trains_on_the_maps_of_every_mapper() -> None:
+    assert {*cli.ImageSource} == {*MapperName, "drawings"}
 
 
 @pytest.mark.parametrize("command", ["yolo", "cnn"])

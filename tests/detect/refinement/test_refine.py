@@ -112,7 +112,7 @@ def test_noisy_rays_give_kind_size_noise_and_standard_deviations(
     normal = []
     for made, true in zip(refined, world.primitives, strict=True):
         assert made is not None and made.primitive.kind is true.kind and made.score > 0.5
-        assert sum(made.chances.values()) == pytest.approx(1.0)
+        assert sum(made.kind_probabilities.values()) == pytest.approx(1.0)
         assert set(made.std) == {"x", "y", *(() if true.theta is None else ("theta",)), *true.kind.sizes}
         normal += [(made.primitive.x - true.x) / made.std["x"], (made.primitive.y - true.y) / made.std["y"]]
         normal += [(made.primitive.size[0] - true.size[0]) / made.std[true.kind.sizes[0]]]
