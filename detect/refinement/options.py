@@ -159,7 +159,7 @@ class MapOptions:
     min_wall: float = 0.8
     """m; a straight line with surface cells over this length is a wall: longer than any primitive."""
     max_walls: int = 16
-    """Walls looked for in a map."""
+    """Detection of walls in a map."""
     wall_width: float = 3.0
     """cells; noise bends a wall: its surface cells lie this near to its line …"""
     wall_density: float = 0.7
@@ -197,7 +197,7 @@ class LineOptions:
     trials: int = 60
     """Pairs of points tried for a line: where half of the points are on it, all miss it in 3 of 10^8 cases."""
     max_points: int = 4000
-    """Points that are looked at; of more, a random sample. Bounds the time."""
+    """The most points used; of more, a random sample. Bounds the time."""
     min_inliers: float = 8.0
     """Points of a line."""
     baseline: float = 8.0
@@ -213,7 +213,7 @@ class WallOptions:
     """Straight walls behind candidates that stand close to them."""
 
     near: float = 0.12
-    """m; a wall is looked for behind candidates this near to it,"""
+    """m; walls are considered as the background of candidates this near to them,"""
     around: float = 0.5
     """m; by its cells this far around,"""
     min_length: float = 0.12

@@ -54,7 +54,7 @@ class McapReader:
     by the index of chunks where that is intact and else in file order.
 
     Args:
-        path: The file, which begins with MAGIC (:func:`prim.log.open_log` has looked).
+        path: The file; it begins with MAGIC, as :func:`prim.log.open_log` checks.
         recover: Pass over damage, and collect it in :attr:`lost`.
 
     Raises:
