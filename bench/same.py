@@ -15,6 +15,7 @@ from __future__ import annotations
 import argparse
 import hashlib
 import json
+import math
 import os
 import subprocess
 import sys
@@ -165,9 +166,10 @@ def differences(before: Any, after: Any, at: str = "") -> Iterator[tuple[str, fl
     elif isinstance(before, list) and isinstance(after, list) and len(before) == len(after):
         for index, (one, other) in enumerate(zip(before, after, strict=True)):
             yield from differences(one, other, f"{at}[{index}]")
-    elif before != after:
-        numbers = isinstance(before, float | int) and isinstance(after, float | int)
-        yield at, abs(before - after) / max(1.0, abs(before)) if numbers else float("inf")
+    elif before != after or isinstance(before, bool) != isinstance(after, bool):
+        numbers = all(isinstance(value, float | int) and not isinstance(value, bool) for value in (before, after))
+        size = abs(before - after) / max(1.0, abs(before)) if numbers else math.inf
+        yield at, math.inf if math.isnan(size) else size
 
 
 def compare(before: dict[str, Any], after: dict[str, Any]) -> bool:

@@ -149,11 +149,12 @@ def classify(z: float, range_min: float, range_max: float) -> int:
         range_max: The sensor's longest range.
 
     Returns:
-        SKIPPED for NaN, -inf and ranges below range_min, NO_RETURN from range_max on, else HIT.
+        SKIPPED for NaN, -inf and ranges below range_min, NO_RETURN from range_max on, else HIT. Limits are compared
+        in the ranges' single precision, as :meth:`prim.scan.Scan.outcomes` does.
     """
-    if not (z >= range_min and z > 0):
+    if not (z >= np.float32(range_min) and z > 0):
         return SKIPPED
-    return HIT if z < range_max else NO_RETURN
+    return HIT if z < np.float32(range_max) else NO_RETURN
 
 
 @inline

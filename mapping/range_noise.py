@@ -7,6 +7,8 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
+from prim.normal import NORMAL_MAD
+
 
 def neighbour_noise(ranges: NDArray[np.float32]) -> float | None:
     """Estimate the range noise from the differences of neighbouring beams, by their median absolute deviation.
@@ -21,4 +23,4 @@ def neighbour_noise(ranges: NDArray[np.float32]) -> float | None:
     differences = np.diff(ranges[np.isfinite(ranges)])
     if not len(differences):
         return None
-    return float(np.median(np.abs(differences))) * 1.4826 / math.sqrt(2)
+    return float(np.median(np.abs(differences))) * NORMAL_MAD / math.sqrt(2)

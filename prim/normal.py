@@ -10,6 +10,9 @@ import numpy as np
 
 from prim.arrays import FloatArray
 
+NORMAL_MAD = 1.4826
+"""A normal distribution's standard deviation over its median absolute deviation."""
+
 
 class NormalTable(NamedTuple):
     """The standard normal distribution at evenly spaced points (N,).

@@ -163,6 +163,11 @@ class Kind(StrEnum):
         """How many corners the outline has; none where it is round."""
         return len(self.row.outline)
 
+    @property
+    def any_apex(self) -> bool:
+        """Whether it is a triangle of which any corner may be the apex where its sides agree: an isosceles one."""
+        return self.corners == 3 and self.row.regular_period != self.row.period
+
     @cached_property
     def longer_first(self) -> bool:
         """Whether both sizes exchanged make the same shape, turned by a quarter: the longer one is then first."""

@@ -10,6 +10,8 @@ from pathlib import Path
 
 import pytest
 
+from prim.shapes import Kind
+
 ROOT = Path(__file__).parents[1]
 PARTS = ("prim", "mapping", "detect", "recorder", "replay")
 
@@ -164,6 +166,14 @@ def test_imports_run_along_the_arrows(path: Path) -> None:
 
 
 @every_source
+def test_imports_are_absolute_and_of_packages_that_are_installed(path: Path) -> None:
+    """Else the tests of arrows would not see them, or the wheel would lack them."""
+    tree = tree_of(path)
+    assert not [node for node in ast.walk(tree) if isinstance(node, ast.ImportFrom) and node.level]
+    assert not imported_packages(tree) & {"bench", "docs", "tests"} and "import_module" not in path.read_text("utf-8")
+
+
+@every_source
 def test_heavy_packages_stay_where_they_belong(path: Path) -> None:
     names = imported_packages(tree_of(path))
     assert "rerun" not in names or name_of(path) == "replay/viewer.py"
@@ -229,7 +239,8 @@ def test_numbers_stand_in_options(path: Path) -> None:
 def test_kinds_are_known_by_their_rows(path: Path) -> None:
     if name_of(path) not in NAMES_KINDS:
         named = re.findall(r"Kind\.(?:SQUARE|RECTANGLE|CIRCLE|TRIANGLE|ELLIPSE)", path.read_text(encoding="utf-8"))
-        assert not named
+        spelled = [node.value for node in ast.walk(tree_of(path)) if isinstance(node, ast.Constant)]
+        assert not named and not {*Kind} & {value for value in spelled if isinstance(value, str)}
 
 
 @pytest.mark.parametrize("path", OUTSIDE, ids=name_of)

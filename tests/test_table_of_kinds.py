@@ -85,6 +85,22 @@ for main, *arguments in (
         assert not ended.code, ended.code
 """
 
+RIGHT_ANGLED = (
+    '    CORNER = "corner", Row(("width", "height"), ((-1 / 3, -1 / 3), (2 / 3, -1 / 3), (-1 / 3, 2 / 3)), '
+    "TURN, TURN, uniform(2, 0.1, 0.3), (90, 90, 90))\n"
+)
+
+ENCODE_AND_DECODE = """
+from detect.networks.parameters import PRESETS, decode_parameters, encode_parameters
+from mapping.grid import GridFrame
+from prim.shapes import Kind, Primitive
+true = Primitive(Kind("corner"), 0.5, 0.5, 0.4, (0.2, 0.3))
+for preset in PRESETS.values():
+    outputs = encode_parameters(true, preset)
+    made = decode_parameters(true.kind, outputs, preset, (40.0, 40.0, 60.0, 60.0), GridFrame(0.01, 0, 0, 100, 100))
+    print(made.theta, *made.size)
+"""
+
 FIT_SQUARES = """
 import numpy as np
 from detect.refinement import kernels
@@ -144,6 +160,12 @@ def test_hexagons_are_recorded_mapped_detected_drawn_and_scored(last_row: str, t
     }
     drawn = [str(chunk.entity_path) for chunk in RrdReader(tmp_path / "six.forward.rrd").stream()]
     assert any("detections" in path for path in drawn)
+
+
+def test_other_triangles_are_not_taken_for_isosceles_ones(last_row: str, tmp_path: Path) -> None:
+    """The networks' outputs for a right-angled one are decoded to what was encoded."""
+    for line in run(ENCODE_AND_DECODE, last_row, last_row + RIGHT_ANGLED, tmp_path).splitlines():
+        assert [float(number) for number in line.split()] == pytest.approx([0.4, 0.2, 0.3], abs=1e-5)
 
 
 def test_an_edited_row_is_not_stale_in_compiled_code(tmp_path: Path) -> None:

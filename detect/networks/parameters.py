@@ -59,8 +59,8 @@ class Preset:
     has_offset: bool
 
     def encodes_corners(self, kind: Kind) -> bool:
-        """Return whether angle and sizes are encoded by the polynomial of the corners: those of triangles."""
-        return self.angle_as_vector and kind.corners == 3
+        """Return whether angle and sizes are encoded by the polynomial of the corners: an isosceles triangle's."""
+        return self.angle_as_vector and kind.any_apex
 
     def angle_outputs(self, kind: Kind) -> int:
         """Return how many of a kind's outputs encode its angle: they come first."""

@@ -156,7 +156,7 @@ def _fit_candidate(candidate: Candidate, bundle: RayBundle, search: bool, sensor
     evidence = {fit.kind: laplace_evidence(fit, options=options.evidence) for fit in possible or fits}
     # the dispersion is left out here, and multiplies the limit: only the Occam factors differ from dividing by it
     ordered = sorted(possible or fits, key=lambda fit: -evidence[fit.kind])
-    limit = evidence[ordered[0].kind] - options.evidence.out_of_question * sensor.dispersion
+    limit = evidence[ordered[0].kind] - options.evidence.log_evidence_margin * sensor.dispersion
     likely = {kind for kind, value in evidence.items() if value > limit}
     likely |= {SPECIAL_CASES[kind] for kind in likely if kind in SPECIAL_CASES}
     candidate.set_fits([fit for fit in ordered if fit.kind in likely], bundle, sensor)
@@ -171,7 +171,13 @@ def _is_unchanged(
     return same_noise and before.footprint == sensor.footprint and fitted_to.is_similar(bundle, options)
 
 
-def find_backgrounds(pool: Executor, candidates: Sequence[Candidate], cells: MapCells, margin: float) -> list[bool]:
+def find_backgrounds(
+    pool: Executor,
+    candidates: Sequence[Candidate],
+    cells: MapCells,
+    margin: float,
+    options: RefinementOptions = DEFAULTS,
+) -> list[bool]:
     """Read from the map what stands behind each candidate: the map without the candidates' own cells.
 
     Args:
@@ -179,13 +185,14 @@ def find_backgrounds(pool: Executor, candidates: Sequence[Candidate], cells: Map
         candidates: The candidates; their background and walls are set.
         cells: The map.
         margin: Cells this near (m) to a candidate are its own.
+        options: How walls are found.
 
     Returns:
         For each candidate whether its background has changed much.
     """
     shapes = [candidate.current for candidate in candidates]
     occupied = cells.without(shapes, margin)
-    walls = walls_behind(cells, shapes, [candidate.start for candidate in candidates])
+    walls = walls_behind(cells, shapes, [candidate.start for candidate in candidates], options.walls, options.lines)
     for wall in walls:
         occupied[wall.cells] = False
     distances = DistanceMap.of(occupied, cells.frame)

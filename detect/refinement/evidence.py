@@ -197,9 +197,9 @@ class SplitCost:
             The cost.
         """
         number = NUMBERS[fit.kind]
-        sure = np.empty(len(bundle))
-        standardized_clearances(OUTLINES, number, fit.p, covariance, bundle.rays, sensor.footprint, sure)
-        hit, missed = sure > 1, sure < -1
+        clearances = np.empty(len(bundle))
+        standardized_clearances(OUTLINES, number, fit.p, covariance, bundle.rays, sensor.footprint, clearances)
+        hit, missed = clearances > 1, clearances < -1
         slope, information = np.zeros(PARAMETERS), np.zeros((PARAMETERS, PARAMETERS))
         constant = gradient(OUTLINES, number, fit.p, sensor.data(bundle.select(hit)), EXACT, slope, information)
         constant -= float(bundle.rays[BACKGROUND, missed].sum())

@@ -137,7 +137,7 @@ def fit_all_kinds(
         earlier: Earlier fits.
         bundle: Its rays.
         sensor: The sensor.
-        options: The numbers.
+        options: Numeric parameters.
 
     Returns:
         The best fit of each kind that is not out of the question.
@@ -149,13 +149,13 @@ def fit_all_kinds(
     best: dict[Kind, float] = {}
     for cost, (kind, _) in ranked:
         best.setdefault(kind, cost)
-    hopeful = {kind for kind, cost in best.items() if cost < min(best.values()) + options.hopeless_kind}
-    hopeful |= {special for kind, special in SPECIAL_CASES.items() if kind in hopeful}
+    contenders = {kind for kind, cost in best.items() if cost < min(best.values()) + options.kind_cost_margin}
+    contenders |= {special for kind, special in SPECIAL_CASES.items() if kind in contenders}
     chosen: list[Start] = []
     for kind in Kind:
-        limit = best[kind] + options.hopeless_start
+        limit = best[kind] + options.start_cost_margin
         own = [start for cost, start in ranked if start[0] is kind and cost < limit]
-        chosen += own[: options.starts_kept] if kind in hopeful else []
+        chosen += own[: options.starts_kept] if kind in contenders else []
     return _best_of_each_kind(chosen, Subset.of(bundle, options.search_rays), sensor, options.fine, options)
 
 
@@ -179,7 +179,7 @@ def refit(
         fits: The earlier fits.
         bundle: All rays.
         sensor: The sensor.
-        options: The numbers.
+        options: Numeric parameters.
 
     Returns:
         The best fit of each kind.
@@ -197,7 +197,7 @@ def refit_same_kind(
         fit: The earlier fit.
         bundle: All rays.
         sensor: The sensor.
-        options: The numbers.
+        options: Numeric parameters.
 
     Returns:
         The fit alone.
@@ -218,7 +218,7 @@ def _best_of_each_kind(
 
     keep(_fit_each(begin, subset, sensor, descent, options))
     apexes = [
-        (kind, p) for kind, fit in best.items() if kind.corners == 3 for p in other_apexes(fit.p, options.equilateral)
+        (kind, p) for kind, fit in best.items() if kind.any_apex for p in other_apexes(fit.p, options.equilateral)
     ]
     keep(_fit_each(apexes, subset, sensor, descent, options))
     no_better = [

@@ -32,7 +32,7 @@ def find_lines(
         min_length: A line has cells for this length (m) at least.
         max_lines: How many to find at most.
         width: Cells lie within this distance (cells) of a line.
-        options: The numbers.
+        options: Numeric parameters.
 
     Returns:
         The lines.
@@ -59,7 +59,7 @@ def trimmed_line(points: FloatArray, resolution: float, options: LineOptions = D
     Args:
         points: (N, 2) in metres.
         resolution: Points within this distance (m) always count.
-        options: The numbers.
+        options: Numeric parameters.
 
     Returns:
         The line.

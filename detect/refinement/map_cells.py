@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from detect.refinement.lines import Line, distance_to_line, find_lines, trimmed_line
-from detect.refinement.options import DEFAULTS, MapOptions
+from detect.refinement.options import DEFAULTS, LineOptions, MapOptions
 from mapping.grid import GridFrame, OccupancyGrid
 from mapping.morphology import beside_free, connected_components, dilate
 from prim.arrays import BoolGrid, FloatArray
@@ -65,7 +65,7 @@ class MapCells:
         labels: The occupied cells' connected components, from 1 on; 0 elsewhere.
         large: Occupied cells of walls and of components larger than any primitive.
         walls: The walls with free space on one side only.
-        options: The numbers.
+        options: Numeric parameters.
     """
 
     frame: GridFrame
@@ -77,7 +77,9 @@ class MapCells:
     options: MapOptions = DEFAULTS.map
 
     @classmethod
-    def of(cls, grid: OccupancyGrid, options: MapOptions = DEFAULTS.map) -> MapCells:
+    def of(
+        cls, grid: OccupancyGrid, options: MapOptions = DEFAULTS.map, lines: LineOptions = DEFAULTS.lines
+    ) -> MapCells:
         """Classify a map's cells.
 
         Straight walls are taken out before components are labelled: what touches one may be a primitive that stands
@@ -85,12 +87,13 @@ class MapCells:
 
         Args:
             grid: The map.
-            options: The numbers.
+            options: Which cells are walls.
+            lines: How walls' lines are found.
 
         Returns:
             The cells.
         """
-        walls, one_sided = _straight_walls(grid, options)
+        walls, one_sided = _straight_walls(grid, options, lines)
         labels, large = connected_components(grid.occupied & ~walls, grid.frame, options.max_extent)
         return cls(grid.frame, grid.occupied, grid.free, labels, walls | large, tuple(one_sided), options)
 
@@ -162,7 +165,9 @@ def _cells_around(frame: GridFrame, primitive: Primitive, reach: float) -> tuple
     return slice(row, last_row), slice(col, last_col), np.stack(np.meshgrid(x, y), axis=-1)
 
 
-def _straight_walls(grid: OccupancyGrid, options: MapOptions) -> tuple[BoolGrid, list[OneSidedWall]]:
+def _straight_walls(
+    grid: OccupancyGrid, options: MapOptions, lines: LineOptions
+) -> tuple[BoolGrid, list[OneSidedWall]]:
     """Return which occupied cells belong to straight walls, and the walls that are free on one side only."""
     resolution = grid.frame.resolution
     surface = grid.frame.centres(grid.occupied & beside_free(grid.free))
@@ -171,7 +176,7 @@ def _straight_walls(grid: OccupancyGrid, options: MapOptions) -> tuple[BoolGrid,
     free = grid.frame.centres(grid.free & dilate(grid.occupied, round(2 * options.wall_cells)))
     near = np.zeros(len(points), np.bool_)
     one_sided = []
-    for line, on_it in _wall_lines(surface, resolution, options):
+    for line, on_it in _wall_lines(surface, resolution, options, lines):
         nx, ny, d = line
         off, along = points @ np.array([nx, ny]) - d, points @ np.array([-ny, nx])
         thin, deep = options.wall_cells * resolution, options.wall_depth
@@ -187,11 +192,13 @@ def _straight_walls(grid: OccupancyGrid, options: MapOptions) -> tuple[BoolGrid,
     return walls, one_sided
 
 
-def _wall_lines(surface: FloatArray, resolution: float, options: MapOptions) -> Iterator[tuple[Line, FloatArray]]:
+def _wall_lines(
+    surface: FloatArray, resolution: float, options: MapOptions, lines: LineOptions
+) -> Iterator[tuple[Line, FloatArray]]:
     """Yield the lines of straight walls, each with the surface cells' centres (N, 2) on it."""
     width = options.wall_width
-    for wide in find_lines(surface, resolution, options.min_wall, options.max_walls, width):
-        line = trimmed_line(surface[distance_to_line(surface, wide) < width * resolution], resolution)
+    for wide in find_lines(surface, resolution, options.min_wall, options.max_walls, width, lines):
+        line = trimmed_line(surface[distance_to_line(surface, wide) < width * resolution], resolution, lines)
         off = distance_to_line(surface, line) / resolution
         on_it = surface[off < width]
         first, last = _ends(on_it, line)

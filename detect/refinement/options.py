@@ -102,12 +102,12 @@ class FitOptions:
     """From earlier fits, with all rays."""
     information_blur: float = 0.001
     """m; information of silhouettes is asked with this blur at least: at narrower ones single jumps count for all."""
-    hopeless_kind: float = 60.0
+    kind_cost_margin: float = 60.0
     """nats; a kind whose coarse fit is less likely by this much than the best is not fitted to more rays."""
-    hopeless_start: float = 20.0
+    start_cost_margin: float = 20.0
     """nats; nor is another fit of one kind."""
     starts_kept: int = 2
-    """Coarse fits of a kind that are gone on with."""
+    """Coarse fits of a kind that are continued."""
     equilateral: float = 1.3
     """A triangle whose sides differ by a smaller factor may have been fitted with the wrong apex."""
     stretch: float = 1.03
@@ -146,7 +146,7 @@ class EvidenceOptions:
     """Standard deviations within which a ray's hit or miss must not change to be summed up once."""
     same_sizes: float = 0.0005
     """m; sizes that differ by less make a square of a rectangle: no pose is known better."""
-    out_of_question: float = 30.0
+    log_evidence_margin: float = 30.0
     """nats (times the dispersion); a kind whose evidence is less by this much is not fitted again."""
 
 
@@ -266,7 +266,7 @@ class AcceptanceOptions:
     """Share of the directions around it in which rays meet it; of candidates that the networks did not find."""
     sectors: int = 24
     """Directions around the centroid that this is counted in."""
-    min_chance: float = 0.33
+    min_kind_probability: float = 0.33
     """Posterior probability of its kind; of such candidates."""
     min_shared: float = 0.25
     """Share of the smaller area that the fit has in common with the guess; of such candidates."""
@@ -275,8 +275,8 @@ class AcceptanceOptions:
     preference: float = 1.5
     """Of duplicates one that the networks found wins unless another's log-likelihood ratio is larger by this factor.
     """
-    sure: float = 0.95
-    """A detection of an earlier pass whose kind has this posterior probability keeps it."""
+    settled_probability: float = 0.95
+    """A detection of an earlier run whose kind has this posterior probability keeps it."""
 
 
 @dataclass(frozen=True)

@@ -31,7 +31,7 @@ def propose(
         cells: The map.
         known: The primitives that are candidates already.
         max_proposals: How many at most; None: ``options.max_proposals``.
-        options: The numbers.
+        options: Numeric parameters.
 
     Returns:
         Rectangles, those of most cells first.
@@ -58,7 +58,7 @@ def components(cells: MapCells, options: ProposalOptions = DEFAULTS.proposals) -
 
     Args:
         cells: The map.
-        options: The numbers.
+        options: Numeric parameters.
 
     Yields:
         The centres (N, 2) in metres of each component's cells.
@@ -95,7 +95,7 @@ def bounding_rectangle(
     Args:
         points: (N, 2) cells' centres (m).
         resolution: The cells' side (m).
-        options: The numbers.
+        options: Numeric parameters.
 
     Returns:
         The rectangle; None where it is smaller or larger than primitives are.

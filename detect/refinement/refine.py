@@ -84,7 +84,7 @@ class Effort:
     """How thoroughly detections are refined.
 
     Attributes:
-        warm_start: An earlier pass. What was sure of its kind then is fitted on from there, which takes a fraction of
+        warm_start: An earlier pass. Where the kind was settled then, its fit is the start, which takes a fraction of
             the time, and the map is not searched for what the networks missed.
         max_proposals: Components of the map that are proposed; None: as in the options.
         rounds: Joint fits once duplicates are gone; None: as in the options.
@@ -116,13 +116,13 @@ def refine_detections(
         noise_std: Range noise (m) where it is known.
         threads: How many are used; results do not depend on it.
         effort: How thoroughly.
-        options: The numbers.
+        options: Numeric parameters.
 
     Returns:
         What the rays support, likeliest kinds first, and what they do not, with the reasons; and the noise (m), None
         where nothing is supported.
     """
-    cells = MapCells.of(grid, options.map)
+    cells = MapCells.of(grid, options.map, options.lines)
     wanted, undecided = _candidates_of(detections, cells, effort, options)
     found = len(detections.found)
     warm_start = effort.warm_start
@@ -158,7 +158,7 @@ def refine_detections(
 def _candidates_of(
     detections: Detections, cells: MapCells, effort: Effort, options: RefinementOptions
 ) -> tuple[list[Detection], set[int]]:
-    """Return what is to be refined (detections first), and the ids of what the networks were not sure of."""
+    """Return what is to be refined, detections first, and the ids of proposals and detections of low score."""
     warm_start = effort.warm_start
     if warm_start:
         unsure = _missing(warm_start.detections, detections, options.acceptance)
@@ -182,11 +182,11 @@ def _missing(before: Detections, now: Detections, limits: AcceptanceOptions) -> 
 
 
 def _known_before(wanted: Sequence[Detection], before: Detections, limits: AcceptanceOptions) -> dict[int, Detection]:
-    """Return, by the index of what is ``wanted``, the earlier detections that were sure of their kind."""
-    sure = [detection for detection in before.found if detection.score >= limits.sure]
+    """Return, by the index of what is ``wanted``, the earlier detections whose kind is settled."""
+    settled = [detection for detection in before.found if detection.score >= limits.settled_probability]
     known = {}
     for number, detection in enumerate(wanted):
-        shared = [(overlap_coefficient(detection.primitive, other.primitive), other) for other in sure]
+        shared = [(overlap_coefficient(detection.primitive, other.primitive), other) for other in settled]
         same = [pair for pair in shared if pair[0] > limits.min_shared]
         if same:
             known[number] = max(same, key=lambda pair: pair[0])[1]
@@ -229,7 +229,7 @@ def proposal_rejection_reason(
     cells: MapCells,
     limits: AcceptanceOptions = DEFAULTS.acceptance,
 ) -> str:
-    """Say why something that the networks did not find, or were not sure of, is no detection.
+    """Say why something that the networks did not detect, or with a low score, is no detection.
 
     Args:
         result: What refinement made of it.
@@ -240,7 +240,7 @@ def proposal_rejection_reason(
     Returns:
         The reason; empty where it is one.
     """
-    prefix = "not found, or hardly, by the networks; "
+    prefix = "not detected by the networks, or with a low score; "
     reason = rejection_reason(result, limits)
     if result is None or reason:
         return prefix + reason
@@ -250,8 +250,8 @@ def proposal_rejection_reason(
         return f"{prefix}it reaches into a wall"
     if overlap_coefficient(result.primitive, guess) < limits.min_shared:
         return f"{prefix}what explains its rays stands elsewhere"
-    if result.score < limits.min_chance:
-        return f"{prefix}its kind is sure by {result.score:.2f} only, less than {limits.min_chance:g}"
+    if result.score < limits.min_kind_probability:
+        return f"{prefix}the probability of its kind is {result.score:.2f}, less than {limits.min_kind_probability:g}"
     return ""
 
 
@@ -276,7 +276,7 @@ class Refinement:
         threads: How many are used.
         guessed_noise: A first guess (m) of the noise, where there is one.
         rounds: Joint fits once duplicates are gone; None: as in the options.
-        options: The numbers.
+        options: Numeric parameters.
     """
 
     cells: MapCells
@@ -328,7 +328,7 @@ class Refinement:
         options, known_noise = self.options, self.noise_std
         noise = known_noise or min(self.guessed_noise or initial_noise(seen, options.sensor), max_noise)
         sensor = BeamModel.create(noise, span, max_std=max_noise, options=options.sensor)
-        find_backgrounds(pool, seen, self.cells, options.map.cleared_first)
+        find_backgrounds(pool, seen, self.cells, options.map.cleared_first, options)
         fit_candidates(pool, seen, [True] * len(seen), sensor)
         single = self._near_rays(without_duplicates(seen, preferred, sensor))
         if not single:
@@ -354,7 +354,7 @@ class Refinement:
         """Fit all in rounds, each beside what the others were in the round before, until none moves."""
         for _ in range(self.options.rounds if self.rounds is None else self.rounds):
             before = [parameters_of(candidate.current) for candidate in candidates]
-            changed = find_backgrounds(pool, candidates, self.cells, self.options.map.cleared)
+            changed = find_backgrounds(pool, candidates, self.cells, self.options.map.cleared, self.options)
             fit_candidates(pool, candidates, changed, sensor)
             now = [parameters_of(candidate.current) for candidate in candidates]
             moved = (np.abs(p - at).max() for p, at in zip(now, before, strict=True))

@@ -17,10 +17,8 @@ from detect.refinement.options import DEFAULTS, SensorOptions
 from detect.refinement.rays import RayBundle
 from detect.refinement.sensor_model import BeamModel, table_nearest
 from prim.arrays import FloatArray
+from prim.normal import NORMAL_MAD
 from prim.shapes import Primitive
-
-NORMAL_MAD = 1.4826
-"""The standard deviation of a normal distribution over its median absolute deviation."""
 
 
 def initial_noise(candidates: Sequence[Candidate], options: SensorOptions = DEFAULTS.sensor) -> float:

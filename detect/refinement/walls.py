@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from detect.refinement.lines import Line, distance_to_line, find_lines, trimmed_line
 from detect.refinement.map_cells import OUTLINE_POINTS, MapCells, is_within
-from detect.refinement.options import DEFAULTS, WallOptions
+from detect.refinement.options import DEFAULTS, LineOptions, WallOptions
 from prim.arrays import FloatArray
 from prim.shapes import Kind, Primitive
 
@@ -58,6 +58,7 @@ def walls_behind(
     candidates: Sequence[Primitive],
     guesses: Sequence[Primitive],
     options: WallOptions = DEFAULTS.walls,
+    lines: LineOptions = DEFAULTS.lines,
 ) -> list[Wall]:
     """Find the walls that candidates stand close to, and that show straight on both sides of them.
 
@@ -65,7 +66,8 @@ def walls_behind(
         cells: The map.
         candidates: The candidates as they are known now.
         guesses: What they were taken for first: a wall is seen from the side on which that stands.
-        options: The numbers.
+        options: What a wall is.
+        lines: How their lines are found.
 
     Returns:
         The walls.
@@ -83,9 +85,9 @@ def walls_behind(
             continue
         for other in np.flatnonzero(_in_square(candidate, centroids, 2 * reach)).tolist():
             near = near[~is_within(candidates[other], near, options.own)]
-        for rough in find_lines(near, resolution, 2 * options.min_length, 2, options.width):
+        for rough in find_lines(near, resolution, 2 * options.min_length, 2, options.width, lines):
             inliers = near[distance_to_line(near, rough) < options.width * resolution]
-            nx, ny, d = trimmed_line(inliers, resolution)
+            nx, ny, d = trimmed_line(inliers, resolution, lines)
             side = 1.0 if nx * guess.x + ny * guess.y > d else -1.0
             wall = _stretch(cells, candidate, guess, (side * nx, side * ny, side * d), near, options)
             if wall is not None:

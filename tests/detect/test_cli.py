@@ -52,6 +52,16 @@ def test_impossible_options(run: Run, arguments: list[str], said: str) -> None:
     assert code == 2 and said in err and err.count("\n") == 1
 
 
+def test_the_presets_are_those_that_exist() -> None:
+    from detect.training.dataset import DATASET_PRESETS
+
+    assert {*cli.DatasetPreset} == DATASET_PRESETS.keys()
+    pytest.importorskip("torch", reason="needs the extra [train]")
+    from detect.training.train import CNN_PRESETS, YOLO_PRESETS
+
+    assert {*cli.CnnPreset} == CNN_PRESETS.keys() and {*cli.YoloPreset} == YOLO_PRESETS.keys()
+
+
 def test_yolo_trains_on_the_maps_of_every_mapper() -> None:
     assert {*cli.ImageSource} == {*MapperName, "drawings"}
 

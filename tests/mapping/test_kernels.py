@@ -41,7 +41,7 @@ def mark_line(end_row: int, end_col: int, hit: bool, rows: int, cols: int, row: 
     z = math.hypot(dx, dy)
     direction = np.array([[dx / z, dy / z]]) if z else np.array([[1.0, 0.0]])
     limits = (0.0, 2 * z + 1) if hit else (0.0, z)
-    ranges = np.array([max(z, 0.25)], dtype=np.float64)
+    ranges = np.array([max(z, 0.25) if hit else math.inf])
     mark_scan(states, (0, 0, 1.0), (ranges, direction, col + 0.5, row + 0.5, 1.0, 0.0, *limits))
     return states
 

@@ -37,6 +37,17 @@ def row_at(grid: OccupancyGrid, y: float) -> np.ndarray:
     return grid.probability[round((y - grid.frame.origin[1]) / grid.frame.resolution - 0.5)]
 
 
+@given(range_min=st.floats(0.15, 0.9), range_max=st.floats(1.0, 9.0))
+@settings(max_examples=40)
+def test_ranges_at_limits_are_classified_as_scans_do(range_min: float, range_max: float) -> None:
+    """In single precision, in which a range at a limit is the limit."""
+    for z in (range_min, range_max):
+        scan = Scan(0, "laser", 0.0, 1.0, range_min, range_max, np.array([z], dtype=np.float32))
+        mapper = DeterministicMapper(0.1)
+        mapper.update(scan, Pose2D(0.05, 0.05))
+        assert bool(mapper.grid().occupied.any()) == bool(scan.measured[0])
+
+
 def test_eq_4() -> None:
     assert inverse_sensor_model(np.array([-1, -0.03, -0.02, -0.01, 0])) == pytest.approx([0.3, 0.3, 0.5, 0.7, 0.9])
     assert inverse_sensor_model(np.array([0.015, 0.03, 1])) == pytest.approx([0.7, 0.5, 0.5])

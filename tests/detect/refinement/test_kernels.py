@@ -102,6 +102,28 @@ def test_gradient_is_that_of_the_cost(outlines: kernels.Outlines, kind: Kind, se
     assert np.linalg.eigvalsh(information).min() > -1e-6 * np.abs(information).max()
 
 
+@pytest.mark.parametrize("outlines", OUTLINES_OF)
+@pytest.mark.parametrize("kind", Kind)
+def test_gradient_of_rays_that_pass_the_silhouette(outlines: kernels.Outlines, kind: Kind) -> None:
+    """Ray by ray, of those that miss by less than the footprint: part of their beam meets the shape."""
+    footprint, p = 0.02, parameters_of(shape(kind, 0.02, 0.01))
+    rays = rays_around(7, 3000)
+    clearances = np.empty(rays.shape[1])
+    kernels.silhouette_clearances(outlines, NUMBERS[kind], p, rays, clearances)
+    rays = rays[:, (clearances < -0.002) & (clearances > -0.9 * footprint)]
+    around = np.concatenate([p + 1e-6 * np.eye(5), p - 1e-6 * np.eye(5)])
+    made, expected = np.zeros((rays.shape[1], 5)), np.empty((rays.shape[1], 5))
+    for i in range(rays.shape[1]):
+        outcomes = np.zeros(1, np.int8)
+        data = kernels.RayData(rays[:, i : i + 1].copy(), outcomes, 0.1, kernels.likelihood_table(1e-3))
+        kernels.gradient(outlines, NUMBERS[kind], p, data, footprint, made[i], np.zeros((5, 5)))
+        costs = np.empty(len(around))
+        kernels.negative_log_likelihoods(outlines, np.full(10, NUMBERS[kind]), around, data, footprint, costs)
+        expected[i] = (costs[:5] - costs[5:]) / 2e-6
+    assert len(made) > 50
+    assert (np.abs(made - expected).sum(axis=0) <= 0.03 * np.abs(expected).sum(axis=0) + 1e-6).all()
+
+
 @pytest.mark.parametrize("kind", [kind for kind in Kind if not kind.is_round])
 def test_a_forms_own_code_agrees_with_that_of_polygons(kind: Kind) -> None:
     """Costs, gradients and information to rounding errors: the silhouette's too."""

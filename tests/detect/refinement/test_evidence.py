@@ -1,0 +1,56 @@
+"""The priors of the kinds, and evidence that two kinds share."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from detect.refinement.evidence import KindPosterior, _merged_special_cases, log_prior, max_size
+from detect.refinement.fit import SPECIAL_CASES
+from detect.refinement.options import DEFAULTS
+from prim.shapes import Kind, Primitive
+
+
+@pytest.mark.parametrize("kind", Kind)
+def test_the_prior_is_a_density_over_the_shapes(kind: Kind) -> None:
+    """It integrates to 1 over the parameters that are canonical: each shape has one name."""
+    rng, count = np.random.default_rng(0), 20_000
+    limit = max_size(kind, DEFAULTS.evidence)
+    turns = 2 * math.pi if kind.has_angle else 1.0
+    sizes = rng.uniform(0, limit, (count, len(kind.sizes)))
+    angles = rng.uniform(0, 2 * math.pi, count)
+    canonical = 0
+    for size, theta in zip(sizes.tolist(), angles.tolist(), strict=True):
+        named = Primitive(kind, 0.0, 0.0, theta if kind.has_angle else None, tuple(size))
+        canonical += (named.canonical().theta, named.canonical().size) == (named.theta, named.size)
+    volume = turns * limit ** len(kind.sizes) * canonical / count
+    assert math.exp(log_prior(kind)) * volume == pytest.approx(1.0, abs=0.05)
+
+
+@pytest.mark.parametrize(("kind", "special"), SPECIAL_CASES.items())
+def test_sizes_that_agree_give_their_evidence_to_the_special_case(kind: Kind, special: Kind) -> None:
+    options = DEFAULTS.evidence
+
+    def posterior(kind: Kind, log_evidence: float) -> KindPosterior:
+        mean = np.array([0.0, 0.0, *([0.0] if kind.has_angle else []), 0.2, 0.2][: len(kind.parameters)])
+        return KindPosterior(mean, np.eye(len(mean)), log_evidence, 0.0, 1.0)
+
+    sampled = {kind: posterior(kind, -3.0), special: posterior(special, -2.0)}
+    fits = [FakeFit(special)]
+    merged = _merged_special_cases(fits, sampled, None, None, options)  # type: ignore[arg-type]
+    assert merged[special].log_evidence == pytest.approx(math.log(math.exp(-3) + math.exp(-2)))
+    assert merged[kind].log_evidence == -math.inf
+    apart = sampled[kind].mean.copy()
+    apart[-1] -= 2 * options.same_sizes
+    sampled[kind] = replace(sampled[kind], mean=apart)
+    assert not _merged_special_cases(fits, sampled, None, None, options)  # type: ignore[arg-type]
+
+
+class FakeFit:
+    """A fit of which only the kind is asked."""
+
+    def __init__(self, kind: Kind) -> None:
+        self.kind = kind
