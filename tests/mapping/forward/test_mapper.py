@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from bench.sessions import Session, recorded
@@ -136,7 +136,7 @@ def test_responsibilities_sum_to_1_in_a_closed_room() -> None:
     assert statistics.stops + statistics.outliers == pytest.approx(statistics.rays, abs=0.01)
 
 
-def reference_log_likelihoods(plain: list[tuple[float, ...]], passes: int) -> list[float]:
+def reference_log_likelihoods(plain: list[tuple[float, ...]], passes: int, estimates_std: bool) -> list[float]:
     """Return the log-likelihood at each pass of plain expectation-maximisation in double precision."""
     o, sigma, epsilon = np.full((SIZE, SIZE), 0.05), 3.0, 0.01
     log_likelihoods = []
@@ -145,17 +145,20 @@ def reference_log_likelihoods(plain: list[tuple[float, ...]], passes: int) -> li
         log_likelihoods.append(sums.log_likelihood)
         visited = sums.hits + sums.passes
         o = np.where(visited > 0, sums.hits / np.maximum(visited, 1e-300), o)
-        sigma *= math.sqrt(sums.squares / sums.stops)
+        sigma *= math.sqrt(sums.squares / sums.stops) if estimates_std else 1.0
         epsilon = sums.outliers / len(plain)
     return log_likelihoods
 
 
+@pytest.mark.parametrize(("estimates_std", "tolerance"), [(False, 1e-9), (True, 1e-3)])
 @settings(max_examples=5)
 @given(seed=st.integers(0, 10**6))
-def test_the_likelihood_of_the_reference_never_falls(seed: int) -> None:
+@example(seed=604)
+def test_the_likelihood_of_the_reference_never_falls(estimates_std: bool, tolerance: float, seed: int) -> None:
+    """Where the noise is estimated, its M step leaves out how it blurs rays that end off the grid."""
     _, plain = random_rays(np.random.default_rng(seed), scans=4, beams=12)
-    log_likelihoods = np.array(reference_log_likelihoods(plain, 12))
-    assert (np.diff(log_likelihoods) >= -1e-9 * np.abs(log_likelihoods[:-1])).all()
+    log_likelihoods = np.array(reference_log_likelihoods(plain, 12, estimates_std))
+    assert (np.diff(log_likelihoods) >= -tolerance * np.abs(log_likelihoods[:-1])).all()
 
 
 @settings(max_examples=25)
@@ -163,8 +166,9 @@ def test_the_likelihood_of_the_reference_never_falls(seed: int) -> None:
 def test_the_likelihood_never_falls(seed: int, width: float) -> None:
     """With the sieve, and noise and outlier share estimated; ``width`` is the noise that the sieve is set for.
 
-    The tolerance is for tails cut off and tables in single precision: in 4500 runs of other seeds the log-likelihood
-    fell by up to 1.4e-5 of itself, near convergence.
+    The tolerance is for the noise's M step, which leaves out how it blurs rays that end off the grid, for tails cut
+    off, and for tables in single precision: in 4500 runs of other seeds the log-likelihood fell by up to 1.4e-5 of
+    itself, near convergence.
     """
     rays, _ = random_rays(np.random.default_rng(seed), scans=12, beams=30)
     level, noise = Level(FRAME, 0.05), RangeNoise(3.0, 0.01)
