@@ -144,7 +144,7 @@ def importance_sample(
             return KindPosterior(at, spread, -math.inf, fit.cost, 0.0)
         weight = np.exp(log_weight - log_weight.max())
         last = count == len(rounds)
-        share = _tempered(weight, options.min_effective_last if last else options.min_effective)
+        share = _tempered(weight, options.min_effective_last if last else options.min_effective, options)
         mean = share @ points
         centred = points - mean
         covariance = (share[:, None] * centred).T @ centred
@@ -212,12 +212,12 @@ class SplitCost:
         return np.asarray(expansion + exact_costs(self.fit.kind, shapes, self.unsure, self.sensor, self.options))
 
 
-def _tempered(weight: FloatArray, min_share: float) -> FloatArray:
+def _tempered(weight: FloatArray, min_share: float, options: EvidenceOptions) -> FloatArray:
     """Return normalised importance weights, tempered until their effective sample size is this share at least."""
     power = 1.0
     share = weight / weight.sum()
-    while 1 / (share**2).sum() < min_share * len(weight) and power > 1e-3:
-        power *= 0.7
+    while 1 / (share**2).sum() < min_share * len(weight) and power > options.min_power:
+        power *= options.tempering
         share = weight**power / (weight**power).sum()
     return np.asarray(share)
 

@@ -70,12 +70,13 @@ class Subset:
         return cls(bundle.select(slice(None, None, stride)), stride) if stride > 1 else cls(bundle)
 
 
-def starts(guess: Primitive, kind: Kind) -> list[FloatArray]:
+def starts(guess: Primitive, kind: Kind, options: FitOptions = DEFAULTS.fit) -> list[FloatArray]:
     """Make starts of a kind's fit for what was taken for another: same centroid, same second moments of area.
 
     Args:
         guess: What it was taken for.
         kind: The kind to fit.
+        options: Numeric parameters.
 
     Returns:
         Parameters (5,), one for each start angle.
@@ -86,9 +87,9 @@ def starts(guess: Primitive, kind: Kind) -> list[FloatArray]:
     mean = math.sqrt(spread[0] * spread[1])
     for turn in start_turns(kind, guess.kind):
         along, across = spread
-        if abs(math.sin(turn)) > 0.9:
+        if abs(math.sin(turn)) > options.across:
             along, across = across, along
-        elif abs(math.sin(turn)) > 0.1 or kind.is_tied:
+        elif abs(math.sin(turn)) > options.aligned or kind.is_tied:
             along = across = mean
         a, b = (math.sqrt(factor) for factor in kind.spread_factors)
         made.append(np.array([x, y, theta + turn if kind.has_angle else 0.0, a * along, b * across]))
@@ -142,7 +143,7 @@ def fit_all_kinds(
     Returns:
         The best fit of each kind that is not out of the question.
     """
-    begin = [(kind, p) for kind in Kind for p in starts(guess, kind)]
+    begin = [(kind, p) for kind in Kind for p in starts(guess, kind, options)]
     coarse = _fit_each(begin, Subset.of(bundle, options.coarse_rays), sensor, options.coarse, options)
     made = [(fit.kind, fit.p) for fit in (*coarse, *earlier)]
     ranked = _ranked([*made, (guess.kind, parameters_of(guess))], bundle, sensor, options)
@@ -280,7 +281,11 @@ def _schedule(descent: Descent, stride: int, sensor: BeamModel, options: FitOpti
         descent.steps,
         descent.tolerance / stride,
         options.first_damping,
+        options.min_damping,
         options.max_damping,
+        options.damping_after_success,
+        options.damping_after_failure,
+        options.damping_where_singular,
         options.min_size,
         options.max_size,
         max(options.information_blur, sensor.footprint),

@@ -146,15 +146,21 @@ class Schedule(NamedTuple):
     """How Levenberg and Marquardt's method descends.
 
     ``blurs`` (m), one after the other; at each, at most ``iterations`` steps, ending where one gains less than
-    ``tolerance`` (nats); the damping's first value and the one at which it gives up; the bounds (m) of width and
-    height; and the least blur (m) that the information is asked with: a jump has none.
+    ``tolerance`` (nats); the damping's first value and its bounds, of which the upper one ends the descent; its
+    factors after a step that gains and one that does not; factor and least value where the damped information is
+    singular; the bounds (m) of width and height; and the least blur (m) that the information is asked with: a jump
+    has none.
     """
 
     blurs: FloatArray
     iterations: int
     tolerance: float
     first_damping: float
+    min_damping: float
     max_damping: float
+    success: float
+    failure: float
+    singular: tuple[float, float]
     min_size: float
     max_size: float
     information_blur: float
@@ -1023,16 +1029,16 @@ def _descend_one(outlines: Any, number: int, start: Any, data: Any, schedule: An
                 p[:] = trial
                 gradient[:] = other_gradient
                 full[:] = other_full
-                damping = max(0.2 * damping, 1e-6) if count else damping
+                damping = max(schedule.success * damping, schedule.min_damping) if count else damping
                 if gained < schedule.tolerance:
                     break
             else:
-                damping *= 8
+                damping *= schedule.failure
             _project(jacobian, size, gradient, full, downhill, information)
             while damping < schedule.max_damping and not _solve_damped(
                 information, downhill, damping, change, lower, size
             ):
-                damping = max(10 * damping, 1e-3)
+                damping = max(schedule.singular[0] * damping, schedule.singular[1])
             if damping > schedule.max_damping:
                 break
             _step(p, jacobian, size, change, schedule, trial)

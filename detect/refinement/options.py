@@ -55,6 +55,14 @@ class SensorOptions:
     """Fewer residuals give no first estimate."""
     min_noise: float = 0.002
     """m; lower bound of the noise: ranges and poses in logs are not known better."""
+    search_step: float = 0.5
+    """First step of the search for the noise, in its logarithm,"""
+    search_refinement: float = 6.0
+    """which is divided by this around the best,"""
+    last_search_step: float = 0.1
+    """until it is smaller than this;"""
+    search_steps: int = 12
+    """at most so many steps."""
     min_rays: int = 20
     """Fewer measured rays give no noise, and fewer scans no dispersion."""
     min_rays_of_scan: int = 4
@@ -114,8 +122,20 @@ class FitOptions:
     """Factor by which an ellipse's start is longer (and shorter) than the circle that it begins with."""
     first_damping: float = 1e-2
     """Levenberg–Marquardt damping at the start."""
+    min_damping: float = 1e-6
+    """Its lower bound."""
     max_damping: float = 1e4
     """Damping at which a descent ends."""
+    damping_after_success: float = 0.2
+    """Factor of the damping after a step that gains (Marquardt 1963 has 0.1)."""
+    damping_after_failure: float = 8.0
+    """Factor after one that does not (10)."""
+    damping_where_singular: tuple[float, float] = (10.0, 1e-3)
+    """Factor, and least damping, where the damped information has no Cholesky decomposition."""
+    across: float = 0.9
+    """Sine of a start's turn from the guess, above which width and height are exchanged."""
+    aligned: float = 0.1
+    """The same, below which they are kept; in between both are the mean."""
     min_size: float = 0.02
     """m; bounds of width and height (of semi-axes) during a descent; the recorder draws no smaller ones."""
     max_size: float = 1.2
@@ -138,6 +158,10 @@ class EvidenceOptions:
     """Effective share of samples, in all rounds but the last, below which weights are tempered."""
     min_effective_last: float = 0.06
     """The same in the last round."""
+    tempering: float = 0.7
+    """Factor of the weights' power in each step of tempering,"""
+    min_power: float = 1e-3
+    """which ends at this power."""
     min_std: tuple[float, ...] = (1e-4, 1e-4, 1e-3, 1e-4, 1e-4)
     """m, m, rad, m, m; lower bounds of the proposal's standard deviations."""
     max_turn: float = 0.5

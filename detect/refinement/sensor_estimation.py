@@ -215,7 +215,7 @@ def maximum_likelihood_noise(
         table = BeamModel.create(std, sensor.span, options=sensor.options).table
         return count * log_std - float(table_nearest(table, outcomes, (ranges - z) / std).sum())
 
-    std = math.exp(_minimize(cost, math.log(sensor.std)))
+    std = math.exp(_minimize(cost, math.log(sensor.std), sensor.options))
     return min(max(std, sensor.options.min_noise), sensor.max_std)
 
 
@@ -226,17 +226,17 @@ def _met(candidate: Candidate, bundle: RayBundle) -> tuple[FloatArray, NDArray[n
     return ranges[meets], bundle.outcomes[meets], bundle.rays[RANGE, meets]
 
 
-def _minimize(cost: Callable[[float], float], at: float, step: float = 0.5) -> float:
+def _minimize(cost: Callable[[float], float], at: float, options: SensorOptions) -> float:
     """Minimise a unimodal function: steps downhill, then a parabola through three points, twice."""
-    here = cost(at)
-    for _ in range(12):
+    here, step = cost(at), options.search_step
+    for _ in range(options.search_steps):
         left, right = cost(at - step), cost(at + step)
         if min(left, right) >= here:
             curve = left + right - 2 * here
             at += 0.5 * step * (left - right) / curve if curve > 0 else 0.0
-            if step < 0.1:
+            if step < options.last_search_step:
                 return at
-            step, here = step / 6, cost(at)
+            step, here = step / options.search_refinement, cost(at)
         elif left < right:
             at, here = at - step, left
         else:
