@@ -19,7 +19,7 @@ from prim.errors import UsageError
 from prim.shapes import Kind, Primitive
 from recorder.session import Session
 from replay import cli
-from replay.detection_stage import add_frame_uncertainty
+from replay.detection_refiner import add_frame_uncertainty
 from replay.options import ReplayOptions
 from replay.pipeline import Pipeline
 from replay.report import report_json, summary_rows
