@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -9,10 +10,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from detect.networks.weights import shipped_weights
+from detect.networks.weights import WeightsError, shipped_weights
 from mapping.grid import GridFrame, OccupancyGrid
 from mapping.mapper import Mapper, make_mapper
-from prim.arrays import FloatArray
 from prim.choices import MapperName
 from prim.errors import UsageError
 from prim.metrics import DetectionErrors, detection_errors
@@ -20,6 +20,7 @@ from prim.scan import PosedScan
 from prim.shapes import Primitive
 from replay.detection_refiner import DetectionRefiner
 from replay.ground_truth import GroundTruth
+from replay.intervals import detection_interval, is_due
 from replay.options import ReplayOptions
 from replay.posed_scans import PosedScans
 from replay.timing import StageTimer
@@ -71,9 +72,15 @@ class DetectionStage:
         detector: The networks.
         options: Options of the replay.
         frame: The place and size of the grid of the replay's map.
+        posed_scans: The scans of the replay.
         truth: The true world, in coordinates of the map; None where it is not known.
-        frame_covariance: The covariance (3, 3; m, rad) of the map frame's own pose; None where it is exact.
+        is_shown: Whether the replay is shown, so that primitives are detected along the way unless the options say
+            otherwise.
         timer: Counts the time towards the stages «detect» and «refine».
+
+    Attributes:
+        skipped: None: detection is possible.
+        note: What a user should know of how often primitives are detected; empty where nothing.
     """
 
     skipped: str | None = None
@@ -83,13 +90,18 @@ class DetectionStage:
         detector: Detector,
         options: ReplayOptions,
         frame: GridFrame,
+        posed_scans: PosedScans,
         truth: GroundTruth | None,
-        frame_covariance: FloatArray | None,
+        is_shown: bool,
         timer: StageTimer,
     ) -> None:
         self._detector = detector
-        self._interval = options.detect_every
+        self._posed_scans = posed_scans
         self._own_mapper = _own_mapper(detector, options, frame)
+        cells = math.prod(GridFrame.covering(frame.bounds, detector.card.resolution).shape)
+        interval = detection_interval(options, len(posed_scans.scan_log), cells, is_shown)
+        self._interval, self.note = interval.scans, interval.note
+        frame_covariance = posed_scans.poses.frame_covariance
         self._refiner = DetectionRefiner(options.noise_std, frame_covariance) if options.refine else None
         self._tracker = _tracker() if self._interval else None
         self._truth = truth
@@ -101,10 +113,7 @@ class DetectionStage:
         return self._interval is not None
 
     def update(self, posed: PosedScan, mapper: Mapper) -> DetectionResult | None:
-        """Add a scan, and detect primitives in the map so far where that is due.
-
-        With an interval of N, that is after the scans at positions N - 1, 2N - 1 and so on in the selection: after N,
-        2N and so on scans, where all have a pose.
+        """Add a scan, and detect primitives in the map so far where that is due, but after the last scan.
 
         Args:
             posed: The scan, which the replay's map has already.
@@ -115,7 +124,7 @@ class DetectionStage:
         """
         with self._timer.stage("detect"):
             self._add(posed)
-            if not self._interval or (posed.position + 1) % self._interval:
+            if not self._is_due(posed.position):
                 return None
             grid = (self._own_mapper or mapper).grid()
             detections = self._detector.detect(grid)
@@ -125,12 +134,15 @@ class DetectionStage:
                 detections, noise_std = self._refiner.refine_so_far(detections, grid)
         return self._result(detections, posed.scan.stamp, noise_std)
 
-    def finish(self, grid: OccupancyGrid, posed_scans: PosedScans) -> DetectionResult:
-        """Detect primitives in the final map.
+    def _is_due(self, position: int) -> bool:
+        is_last = position == len(self._posed_scans.scan_log) - 1
+        return self._interval is not None and is_due(position, self._interval) and not is_last
+
+    def finish(self, grid: OccupancyGrid) -> DetectionResult:
+        """Detect primitives in the final map, and refine them with the rays of all scans.
 
         Args:
             grid: The replay's map of all scans.
-            posed_scans: All scans.
 
         Returns:
             What was detected.
@@ -141,10 +153,10 @@ class DetectionStage:
             detections = self._detector.detect(grid)
         noise_std = None
         if self._refiner:
-            pieces = (piece for posed in posed_scans for piece in posed.pieces)
+            pieces = (piece for posed in self._posed_scans for piece in posed.pieces)
             with self._timer.stage("refine"):
                 detections, noise_std = self._refiner.refine(detections, grid, pieces)
-        return self._result(detections, int(posed_scans.scan_log.stamps[-1]), noise_std)
+        return self._result(detections, int(self._posed_scans.scan_log.stamps[-1]), noise_std)
 
     def _add(self, posed: PosedScan) -> None:
         """Add a scan to the detector's own map, and to those that refine detections before the last scan."""
@@ -180,6 +192,7 @@ class NoDetection:
     """
 
     streaming = False
+    note = ""
 
     def __init__(self, skipped: str | None = None) -> None:
         self.skipped = skipped
@@ -187,15 +200,16 @@ class NoDetection:
     def update(self, posed: PosedScan, mapper: Mapper) -> None:
         """See :meth:`DetectionStage.update`."""
 
-    def finish(self, grid: OccupancyGrid, posed_scans: PosedScans) -> None:
+    def finish(self, grid: OccupancyGrid) -> None:
         """See :meth:`DetectionStage.finish`."""
 
 
 def make_detection_stage(
     options: ReplayOptions,
     frame: GridFrame,
+    posed_scans: PosedScans,
     truth: GroundTruth | None,
-    frame_covariance: FloatArray | None,
+    is_shown: bool,
     timer: StageTimer,
 ) -> DetectionStage | NoDetection:
     """Make the stage that detects, with the weights that are named or those that come with prim.
@@ -203,18 +217,19 @@ def make_detection_stage(
     Args:
         options: Options of the replay.
         frame: The place and size of the grid of the replay's map.
+        posed_scans: The scans of the replay.
         truth: The true world, in coordinates of the map; None where it is not known.
-        frame_covariance: The covariance (3, 3; m, rad) of the map frame's own pose; None where it is exact.
+        is_shown: Whether the replay is shown.
         timer: Counts the time of loading towards the stage «detect».
 
     Returns:
         The stage; a :class:`NoDetection` where detection is not wanted, or where it was not explicitly asked for and
-        there are no weights for the mapper, or the detector's own map would have too many cells.
+        there are no weights for the mapper that can be used, or the detector's own map would have too many cells.
 
     Raises:
         UsageError: Detection was explicitly asked for, by weights or an interval, and there are no weights for the
             mapper, or the detector's own map would have too many cells.
-        WeightsError: The weights cannot be used, whether or not detection was explicitly asked for.
+        WeightsError: Detection was explicitly asked for, and the weights cannot be used.
     """
     if not options.detect:
         return NoDetection()
@@ -224,8 +239,8 @@ def make_detection_stage(
         if weights is None:
             raise UsageError(f"no weights for maps of {options.mapper} come with prim: give --weights")
         detector = _load(weights, options.mapper, timer)
-        return DetectionStage(detector, options, frame, truth, frame_covariance, timer)
-    except UsageError as error:
+        return DetectionStage(detector, options, frame, posed_scans, truth, is_shown, timer)
+    except (UsageError, WeightsError) as error:
         if explicit:
             raise
         return NoDetection(str(error))
