@@ -260,6 +260,25 @@ class Primitive:
         if min(self.size) <= 0:
             raise ValueError(f"a {self.kind} has a size that is not positive: {self.sizes}")
 
+    @classmethod
+    def of(cls, kind: str, x: float, y: float, theta: float | None = None, **sizes: float) -> Primitive:
+        """Make a primitive by the names of its kind and sizes: ``Primitive.of("circle", 0, 0, radius=0.1)``.
+
+        Args:
+            kind: The kind's name.
+            x: The area centroid's x in the map frame (m).
+            y: The same along y (m).
+            theta: Its heading (rad); None where the kind has none.
+            **sizes: All sizes of the kind by name (m).
+
+        Returns:
+            The primitive.
+
+        Raises:
+            ValueError: There is no such kind, or the values do not fit it.
+        """
+        return cls.from_json({"kind": kind, "x": x, "y": y, "theta": theta, "size": sizes})
+
     @property
     def sizes(self) -> dict[str, float]:
         """The sizes by name (m), as logs and reports hold them."""

@@ -11,7 +11,7 @@ from contextlib import suppress
 from dataclasses import dataclass
 from itertools import takewhile
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
@@ -20,10 +20,8 @@ from prim.choices import MapperName, PoseSourceName, SensorModelName
 from prim.errors import PrimError, UsageError
 
 if TYPE_CHECKING:
-    from prim.se2 import Pose2D
     from prim.world import Bounds
     from replay.options import ReplayOptions
-    from replay.poses.fusion_options import FusionInputs
     from replay.result import ReplayResult
     from replay.viewing.protocol import Viewer, ViewerOptions
 
@@ -159,14 +157,13 @@ def replay(
     Each log leaves a recording and a report in this folder: LOG.MAPPER.rrd and LOG.MAPPER.report.json. Several
     mappers share a recording, and each has a report.
     """
-    from replay.options import ReplayOptions
-    from replay.selection import Selection
+    from replay.keywords import replay_options
     from replay.viewing.protocol import ViewerOptions
 
     viewer = ViewerOptions(save, spawn, connect, serve, live=rate is not None)
     if no_viewer and (viewer != ViewerOptions(live=viewer.live) or map_every):
         raise UsageError("--no-viewer excludes --save, --spawn, --connect, --serve and --map-every")
-    options = ReplayOptions(
+    options = replay_options(
         mapper=mapper,
         sensor_model=sensor_model.value,
         noise_std=noise_std,
@@ -175,13 +172,21 @@ def replay(
         bounds=_parse_bounds(bounds),
         scan_topic=scan_topic,
         odom_topic=odom_topic,
-        laser_offset=_laser_pose(laser_offset),
+        laser_offset=_in_radians(laser_offset),
         max_range=max_range,
         standing_still=standing_still,
-        fuse=_fuse_options(fuse, gps_topic, compass_topic, pose_noise, odom_noise),
+        fuse=fuse,
+        gps_topic=gps_topic,
+        compass_topic=compass_topic,
+        pose_noise=_in_radians(pose_noise),
+        odom_noise=_in_radians(odom_noise),
         deskew=not no_deskew,
         match_scans=match_scans,
-        selection=Selection(start, end, duration, n_scans, stride),
+        start=start,
+        end=end,
+        duration=duration,
+        n_scans=n_scans,
+        stride=stride,
         rate=rate,
         map_every=map_every,
         detect=not no_detect,
@@ -214,7 +219,9 @@ class OutputFiles:
         Returns:
             The files of this log.
         """
-        stem = log.resolve().name.removesuffix(".part").removesuffix(".mcap")
+        from replay.exports import log_stem
+
+        stem = log_stem(log)
         name = f"{stem}.{'-'.join(mappers)}.rrd"
         recording = self.recording or (Path(name) if with_recording else None)
         report = self.report or Path(
@@ -401,39 +408,9 @@ def _keep_serving() -> None:
             time.sleep(3600)
 
 
-def _laser_pose(offset: tuple[float, float, float] | None) -> Pose2D | None:
-    """Return the laser's pose on the robot from x, y (m) and an angle in degrees."""
-    from prim.se2 import Pose2D
-
-    return None if offset is None else Pose2D(offset[0], offset[1], math.radians(offset[2]))
-
-
-def _fuse_options(
-    sensors: str | None,
-    gps_topic: str | None,
-    compass_topic: str | None,
-    pose_noise: tuple[float, float] | None,
-    odom_noise: tuple[float, float] | None,
-) -> FusionInputs:
-    """Parse what poses are fused from and its noise, given in m and degrees. Raises UsageError."""
-    from replay.poses.fusion_options import SENSORS, FusionInputs, SensorNoise
-
-    names = SENSORS if sensors is None else tuple(name.strip() for name in sensors.split(","))
-    unknown = [name for name in names if name not in SENSORS]
-    if unknown:
-        raise UsageError(
-            f"--fuse {sensors}: {unknown[0] or 'an empty name'} is no sensor; they are {', '.join(SENSORS)}"
-        )
-    for option, given in (("--pose-noise", pose_noise), ("--odom-noise", odom_noise)):
-        if given is not None and not all(0 < value < math.inf for value in given):
-            raise UsageError(f"{option} is {given[0]:g} {given[1]:g}: both must be above 0")
-    noise = SensorNoise(*_in_radians(pose_noise), *_in_radians(odom_noise))
-    return FusionInputs(tuple(name for name in SENSORS if name in names), gps_topic, compass_topic, noise)
-
-
-def _in_radians(noise: tuple[float, float] | None) -> tuple[float | None, float | None]:
-    """Convert noise from m and degrees to m and rad; None stays None."""
-    return (None, None) if noise is None else (noise[0], math.radians(noise[1]))
+def _in_radians(values: tuple[float, ...] | None) -> Any:
+    """Convert the last of some values from degrees to radians; None stays None."""
+    return None if values is None else (*values[:-1], math.radians(values[-1]))
 
 
 def join_bounds(arguments: Sequence[str]) -> list[str]:

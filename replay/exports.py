@@ -84,6 +84,11 @@ def write_trajectory(path: Path, result: ReplayResult) -> None:
         path.write_text("".join(lines), encoding="utf-8")
 
 
+def log_stem(path: Path) -> str:
+    """Return the name that a log's outputs begin with: its own without its suffix."""
+    return path.resolve().name.removesuffix(".part").removesuffix(".mcap")
+
+
 def map_files(stem: Path) -> tuple[Path, Path]:
     """Return the paths of a map's image and its description; ``stem`` may have either's suffix."""
     name = stem.name.removesuffix(".yaml").removesuffix(".pgm")

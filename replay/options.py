@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Final, Literal
@@ -99,6 +100,7 @@ class ReplayOptions:
         if not self.detect and (self.detect_every or self.weights or not self.refine):
             raise UsageError("--no-detect excludes --detect-every, --weights and --no-refine")
         self._check_poses()
+        self._check_noise()
 
     @property
     def mappers(self) -> tuple[str, ...]:
@@ -152,3 +154,13 @@ class ReplayOptions:
         offset = self.laser_offset
         if offset is not None and not (np.abs((offset.x, offset.y, offset.theta)) < MAX_OFFSET).all():
             raise UsageError(f"--laser-offset is {offset.x:g} {offset.y:g}: it must be metres on a robot")
+
+    def _check_noise(self) -> None:
+        noise = self.fuse.noise
+        for name, metres, radians in (
+            ("--pose-noise", noise.position_std, noise.heading_std),
+            ("--odom-noise", noise.odometry_translation_std, noise.odometry_rotation_std),
+        ):
+            for value, unit, factor in ((metres, "m", 1.0), (radians, "degrees", math.degrees(1))):
+                if value is not None and not 0 < value < math.inf:
+                    raise UsageError(f"{name} has {factor * value:g} {unit}: both must be above 0")

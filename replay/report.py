@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import numpy as np
@@ -13,6 +13,7 @@ from mapping.map_metrics import MapScores
 from prim.metrics import DetectionErrors
 from prim.shapes import Kind
 from replay.detection_stage import DetectionResult
+from replay.found_primitives import found_primitives
 from replay.notes import pluralize
 from replay.poses.fusion_options import COMPASS, GPS, ODOM
 from replay.poses.laser_poses import FusedSensor, LaserPoses
@@ -72,7 +73,7 @@ def report_json(result: ReplayResult) -> dict[str, Any]:
             "evidence": _visits(result.grid),
             "scores": result.scores.to_json() if result.scores else None,
         },
-        "primitives": _primitives(result.detections),
+        "primitives": [primitive.to_json() for primitive in found_primitives(result.detections)],
         "refine": {"noise_std_m": result.detections.noise_std if result.detections else None},
         "errors": _errors(result.detections),
         "timing": {f"{name}_s": value for name, value in seconds.items()}
@@ -114,28 +115,6 @@ def pose_std(poses: LaserPoses) -> tuple[float, float] | None:
         return None
     variances = poses.covariances[poses.valid].diagonal(axis1=1, axis2=2).mean(axis=0)
     return float(np.sqrt(variances[:2].sum())), float(np.sqrt(variances[2]))
-
-
-def _primitives(result: DetectionResult | None) -> list[dict[str, Any]]:
-    """Return the detected primitives, highest score first."""
-    if result is None:
-        return []
-    return [
-        {"id": identity.id}
-        | detection.primitive.to_json()
-        | {
-            "score": detection.score,
-            "stage": "detected" if detection.std is None else "refined",
-            "std": None if detection.std is None else dict(detection.std),
-            "chances": _by_name(detection.kind_probabilities),
-        }
-        for identity, detection in zip(result.identities, result.detections.found, strict=True)
-    ]
-
-
-def _by_name(kind_probabilities: Mapping[Kind, float] | None) -> dict[str, float] | None:
-    """Return the probabilities of the kinds by name; None where they are not known."""
-    return None if kind_probabilities is None else {str(kind): chance for kind, chance in kind_probabilities.items()}
 
 
 def _errors(result: DetectionResult | None) -> dict[str, Any] | None:

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 __all__ = ["open_log"]
 
 
-def open_log(path: Path, recover: bool = False) -> LogSource:
+def open_log(path: str | Path, recover: bool = False) -> LogSource:
     """Open a log for reading; its format is found by its first bytes.
 
     Args:
@@ -27,7 +27,7 @@ def open_log(path: Path, recover: bool = False) -> LogSource:
     Raises:
         LogReadError: The file cannot be read, is damaged (unless ``recover``), or is no log of a known format.
     """
-    file = _log_file(path)
+    file = _log_file(Path(path))
     start = _first_bytes(file)
     for magic, open_source in _SOURCES.items():
         if start.startswith(magic):

@@ -1,0 +1,207 @@
+"""The options of a recording by keyword, as the command line and the API give them."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Collection, Mapping, Sequence
+from pathlib import Path
+from typing import Any, TypedDict, Unpack
+
+from prim.errors import UsageError
+from prim.shapes import Kind
+from recorder.odometry import OdometryNoise
+from recorder.sensors import Compass, Gps, Lidar
+from recorder.session import SessionOptions
+from recorder.world import WorldOptions
+
+PAPER_NOISE_UNIT = 5.0
+"""``noise=1`` is a standard deviation of this many metres (the paper's IV-A)."""
+
+MIN_RATE, MAX_RATE = 1e-3, 1e6
+"""Scans per second; beyond, stamps in whole ns run into each other or out of their range."""
+
+MAX_LENGTH = 1e6
+"""Floors and ranges (m) are no larger: float32 ranges would be off by more than centimetres."""
+
+FULL_TURN, ROUNDING = 2 * math.pi, 1e-9
+
+ALL_KINDS = "all"
+
+
+class RecordingKeywords(TypedDict, total=False):
+    """What may be given of a recording; what is not given, or None, is as on the command line.
+
+    Lengths are metres, angles radians, times seconds.
+    """
+
+    seed: int
+    """The same seed and options write the same bytes."""
+    world: str | Path | None
+    """A file that describes the world; it excludes size, walls, kinds and per_kind."""
+    size: tuple[float, float] | None
+    """The floor, along x and y."""
+    walls: bool | None
+    """Whether there is a wall along each edge of the floor."""
+    kinds: Sequence[str] | str | None
+    """The kinds of primitives to draw: a list, or separated by commas; or «all»."""
+    per_kind: int | tuple[int, int] | None
+    """How many of each kind: a number, or fewest and most."""
+    motion: str
+    """«warp»: the robot is set on a grid of positions; «drive»: it drives."""
+    stops: tuple[int, int] | None
+    """Columns and rows of the grid of positions."""
+    duration: float | None
+    """How long it drives."""
+    speed: float | None
+    """How fast it drives (m/s)."""
+    movable: bool
+    """Whether a driving robot can push the primitives."""
+    odom_noise: tuple[float, float] | None
+    """Standard deviations of the odometry's position (m) and heading (rad) after one metre."""
+    rate: float
+    """Scans per second."""
+    rays: int
+    """Beams in a scan."""
+    fov: float
+    """Field of view (rad)."""
+    range_min: float
+    range_max: float
+    noise: float | None
+    """Standard deviation of the range noise as a share of 5 m, the paper's unit."""
+    noise_std: float | None
+    """Standard deviation of the range noise (m); it excludes noise."""
+    gps_noise: float
+    """Standard deviation of GPS positions (m)."""
+    compass_noise: float
+    """Standard deviation of compass headings (rad)."""
+
+
+PARAMETERS = frozenset(RecordingKeywords.__annotations__)
+"""The names of all keywords."""
+
+SWITCHES = frozenset({"walls", "movable"})
+"""Those that are true or false."""
+
+
+def recording_options(**keywords: Unpack[RecordingKeywords]) -> SessionOptions:
+    """Make the options of a recording.
+
+    Args:
+        **keywords: See :class:`RecordingKeywords`.
+
+    Returns:
+        The options.
+
+    Raises:
+        UsageError: A keyword does not exist, a value is impossible, or two exclude each other.
+    """
+    unknown = sorted(set(keywords) - PARAMETERS)
+    if unknown:
+        raise UsageError(f"a recording has no parameter {unknown[0]!r}; it has {', '.join(sorted(PARAMETERS))}")
+    given: dict[str, Any] = {name: value for name, value in keywords.items() if value is not None}
+    _check_combinations(given)
+    _check_values(given)
+    converted = {name: convert(given[name]) for name, convert in _CONVERTED.items() if name in given}
+    if "noise" in given:
+        given["noise_std"] = PAPER_NOISE_UNIT * given["noise"]
+    options = SessionOptions(
+        world=WorldOptions(**_some({**given, **converted}, _DRAWN)),
+        lidar=Lidar(**_some(given, _LIDAR)),
+        **_some(given, _DIRECT),
+        **{_FIELDS[name]: value for name, value in converted.items() if name in _FIELDS},
+    )
+    _check_scanner(options)
+    return options
+
+
+def _some(given: Mapping[str, Any], names: Collection[str]) -> dict[str, Any]:
+    """Return what is given of some parameters."""
+    return {name: given[name] for name in names if name in given}
+
+
+def _check_combinations(given: Mapping[str, Any]) -> None:
+    """Raise UsageError where parameters exclude each other."""
+    motion = given.get("motion", SessionOptions.motion)
+    if motion not in ("warp", "drive"):
+        raise UsageError(f"--motion {motion}: it is warp or drive")
+    drawn = [name for name in _DRAWN if name in given]
+    if "world" in given and drawn:
+        raise UsageError("--world excludes --size, --no-walls, --kinds and --per-kind: the file says it all")
+    _refuse(given, _WARPED if motion == "drive" else _DRIVEN, motion)
+    if "noise" in given and "noise_std" in given:
+        raise UsageError("--noise and --noise-std say the same in two units: give one of them")
+
+
+def _refuse(given: Mapping[str, Any], names: Collection[str], motion: str) -> None:
+    """Raise UsageError where a parameter is given that does not go with the motion."""
+    wrong = [name for name in names if given.get(name)]
+    if wrong:
+        raise UsageError(f"{_option(wrong[0])} does not go with --motion {motion}")
+
+
+def _check_values(given: Mapping[str, Any]) -> None:
+    """Raise UsageError where a number is out of its range."""
+    for name, least in (*((name, None) for name in _POSITIVE), *((name, 0) for name in _NOT_NEGATIVE)):
+        if name not in given:
+            continue
+        value = min(given[name]) if isinstance(given[name], Sequence) else given[name]
+        if not math.isfinite(value) or value < 0 or (least is None and value == 0):
+            raise UsageError(
+                f"{_option(name)} is {value:g}: it must {'be above' if least is None else 'not be below'} 0"
+            )
+
+
+def _check_scanner(options: SessionOptions) -> None:
+    """Raise UsageError for a floor or a scanner that cannot be."""
+    lidar, rate = options.lidar, options.rate
+    if lidar.range_min >= lidar.range_max:
+        raise UsageError(f"--range-min {lidar.range_min:g} is not below --range-max {lidar.range_max:g}")
+    if not MIN_RATE <= rate <= MAX_RATE:
+        raise UsageError(f"--rate is {rate:g}: it must be from {MIN_RATE:g} to {MAX_RATE:.0f} scans per second")
+    if max(lidar.range_max, *options.world.size) > MAX_LENGTH:
+        raise UsageError(f"--range-max and --size must not be above {MAX_LENGTH:.0f} m")
+    if lidar.fov > FULL_TURN * (1 + ROUNDING):
+        raise UsageError(f"--fov {math.degrees(lidar.fov):g} degrees is more than a full turn")
+
+
+def _kinds(listed: Sequence[str] | str) -> tuple[Kind, ...]:
+    if isinstance(listed, str):
+        listed = [*Kind] if listed == ALL_KINDS else [name.strip() for name in listed.split(",") if name.strip()]
+    unknown = [name for name in listed if name not in [*Kind]]
+    if unknown or not listed:
+        what = f"{', '.join(unknown)} is no kind" if unknown else "it names no kind"
+        raise UsageError(f"--kinds {','.join(listed)}: {what}; the kinds are {','.join(Kind)}")
+    return tuple(Kind(name) for name in listed)
+
+
+def _per_kind(counts: int | tuple[int, int]) -> tuple[int, int]:
+    fewest, most = (counts, counts) if isinstance(counts, int) else counts
+    if not 0 <= fewest <= most:
+        raise UsageError(f"--per-kind {fewest}-{most} is not a range from small to large")
+    return fewest, most
+
+
+def _option(name: str) -> str:
+    return f"--{name.replace('_', '-')}"
+
+
+_DRAWN = ("size", "walls", "kinds", "per_kind")
+_DRIVEN = ("duration", "speed", "movable", "odom_noise")
+_WARPED = ("stops",)
+_LIDAR = ("rays", "fov", "range_min", "range_max", "noise_std")
+_DIRECT = ("seed", "motion", "stops", "duration", "speed", "movable", "rate")
+_POSITIVE = ("size", "stops", "duration", "speed", "rate", "rays", "fov", "range_max")
+_NOT_NEGATIVE = ("range_min", "noise", "noise_std", "gps_noise", "compass_noise", "odom_noise", "seed")
+
+_CONVERTED: Mapping[str, Callable[[Any], Any]] = {
+    "kinds": _kinds,
+    "per_kind": _per_kind,
+    "world": Path,
+    "gps_noise": Gps,
+    "compass_noise": Compass,
+    "odom_noise": lambda noise: OdometryNoise(*noise),
+}
+"""What a parameter's value becomes in the options of a session."""
+
+_FIELDS = {"world": "world_file", "gps_noise": "gps", "compass_noise": "compass", "odom_noise": "odometry"}
+"""The options of a session that parameters of other names become."""

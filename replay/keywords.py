@@ -1,0 +1,128 @@
+"""The options of a replay by keyword, as the command line and the API give them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Literal, TypedDict, Unpack
+
+from prim.errors import UsageError
+from prim.se2 import Pose2D
+from prim.world import Bounds
+from replay.options import ReplayOptions
+from replay.poses.fusion_options import SENSORS, FusionInputs, SensorNoise
+from replay.selection import Selection
+
+
+class ReplayKeywords(TypedDict, total=False):
+    """What may be given of a replay; what is not given, or None, is as on the command line.
+
+    Lengths are metres, angles radians, times seconds. :class:`replay.options.ReplayOptions` and
+    :class:`replay.selection.Selection` say what each means; the rest is described here.
+    """
+
+    mapper: str
+    sensor_model: str
+    noise_std: float | None
+    pose: str
+    resolution: float
+    bounds: Bounds | None
+    scan_topic: str | None
+    odom_topic: str | None
+    laser_offset: tuple[float, float, float] | Pose2D | None
+    """The laser's pose on the robot: x, y (m), heading (rad)."""
+    max_range: float | None
+    standing_still: bool
+    fuse: Sequence[str] | str | None
+    """The sensors to fuse, of «odom», «gps», «compass»: a list, or separated by commas."""
+    gps_topic: str | None
+    compass_topic: str | None
+    pose_noise: tuple[float, float] | None
+    """Standard deviations of GPS positions (m) and compass headings (rad)."""
+    odom_noise: tuple[float, float] | None
+    """Standard deviations of the odometry's position (m) and heading (rad) after one metre."""
+    match_scans: bool
+    deskew: bool
+    start: float | None
+    end: float | None
+    duration: float | None
+    n_scans: int | None
+    stride: int
+    rate: float | None
+    map_every: int | None
+    detect: bool
+    detect_every: int | Literal["end"] | None
+    refine: bool
+    weights: str | Path | None
+    recover: bool
+
+
+PARAMETERS = frozenset(ReplayKeywords.__annotations__)
+"""The names of all keywords."""
+
+SWITCHES = frozenset({"standing_still", "match_scans", "deskew", "detect", "refine", "recover"})
+"""Those that are true or false."""
+
+_SELECTION = ("start", "end", "duration", "n_scans", "stride")
+_FUSION = ("fuse", "gps_topic", "compass_topic", "pose_noise", "odom_noise")
+
+
+def replay_options(**keywords: Unpack[ReplayKeywords]) -> ReplayOptions:
+    """Make the options of a replay.
+
+    Args:
+        **keywords: See :class:`ReplayKeywords`.
+
+    Returns:
+        The options.
+
+    Raises:
+        UsageError: A keyword does not exist, a value is impossible, or two exclude each other.
+    """
+    unknown = sorted(set(keywords) - PARAMETERS)
+    if unknown:
+        raise UsageError(f"a replay has no parameter {unknown[0]!r}; it has {', '.join(sorted(PARAMETERS))}")
+    given = {name: value for name, value in keywords.items() if value is not None}
+    selection = Selection(**{name: given.pop(name) for name in _SELECTION if name in given})  # type: ignore[arg-type]
+    fuse = _fusion_inputs(**{name: given.pop(name) for name in _FUSION if name in given})  # type: ignore[arg-type]
+    if "laser_offset" in given:
+        given["laser_offset"] = _as_pose(given["laser_offset"])  # type: ignore[arg-type]
+    if "weights" in given:
+        given["weights"] = Path(given["weights"])  # type: ignore[arg-type]
+    if "bounds" in given:
+        given["bounds"] = _as_bounds(given["bounds"])  # type: ignore[arg-type]
+    return ReplayOptions(selection=selection, fuse=fuse, **given)  # type: ignore[arg-type]
+
+
+def _fusion_inputs(
+    fuse: Sequence[str] | str | None = None,
+    gps_topic: str | None = None,
+    compass_topic: str | None = None,
+    pose_noise: tuple[float, float] | None = None,
+    odom_noise: tuple[float, float] | None = None,
+) -> FusionInputs:
+    """Return what poses are fused from, and its noise. Raises UsageError."""
+    listed = fuse.split(",") if isinstance(fuse, str) else fuse
+    names = SENSORS if listed is None else tuple(name.strip() for name in listed)
+    unknown = [name for name in names if name not in SENSORS]
+    if unknown:
+        raise UsageError(
+            f"--fuse {','.join(names)}: {unknown[0] or 'an empty name'} is no sensor; they are {', '.join(SENSORS)}"
+        )
+    noise = SensorNoise(*(pose_noise or (None, None)), *(odom_noise or (None, None)))
+    return FusionInputs(tuple(name for name in SENSORS if name in names), gps_topic, compass_topic, noise)
+
+
+def _as_pose(offset: tuple[float, float, float] | Pose2D) -> Pose2D:
+    if isinstance(offset, Pose2D):
+        return offset
+    if len(offset) != 3:
+        raise UsageError(f"--laser-offset has {len(offset)} values: give x, y and heading")
+    return Pose2D(*offset)
+
+
+def _as_bounds(bounds: Sequence[float]) -> Bounds:
+    if len(bounds) != 4:
+        raise UsageError(f"--bounds has {len(bounds)} values: give x0, y0, x1 and y1")
+    x0, y0, x1, y1 = bounds
+    return x0, y0, x1, y1

@@ -1,0 +1,174 @@
+"""The API: what a replay returns, and errors that name parameters."""
+
+import inspect
+import json
+import typing
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+import prim
+from recorder.keywords import SWITCHES as RECORDING_SWITCHES
+from recorder.keywords import RecordingKeywords
+from recorder.session import Session
+from replay import cli
+from replay.api import Result
+from replay.keywords import SWITCHES, ReplayKeywords
+
+
+@pytest.fixture(scope="module")
+def result(noisy_session: Session) -> Result:
+    return prim.replay(str(noisy_session.path))
+
+
+def test_a_replay_is_that_of_the_command_line(result: Result, noisy_session: Session, in_tmp: Path) -> None:
+    """The default mapper and all other defaults are those of prim-replay."""
+    from prim import console
+
+    assert console.run(cli.app, "prim-replay", [str(noisy_session.path), "--no-viewer", "--quiet"]) == 0
+    report = json.loads(Path("noisy.prob.report.json").read_text())
+    assert {**report, "timing": None} == {**json.loads(json.dumps(result.report)), "timing": None}
+
+
+def test_primitives_have_sizes_deviations_and_chances_by_name(result: Result) -> None:
+    assert result.primitives and result.errors is not None
+    for found in result.primitives:
+        assert set(found.size) == set(found.kind.sizes) and found.std is not None and found.chances is not None
+        assert found.chances[found.kind] == found.score and set(found.std) >= {"x", "y", *found.size}
+        assert found.primitive.to_json().items() <= found.to_json().items()
+
+
+def test_the_table_has_a_row_for_each_primitive(result: Result) -> None:
+    rows = result.table().to_pylist()
+    assert [row["id"] for row in rows] == [found.id for found in result.primitives]
+    for row, found in zip(rows, result.primitives, strict=True):
+        assert (row["kind"], row["x"], row["theta"]) == (found.kind, found.x, found.theta)
+        assert {name: row[name] for name in found.size} == found.size
+        assert row["std_x"] == found.std["x"] and row[f"chance_{found.kind}"] == found.score  # type: ignore[index]
+        others = {name for kind in prim.Kind for name in kind.sizes} - set(found.size)
+        assert all(row[name] is None and row[f"std_{name}"] is None for name in others)
+
+
+def test_the_picture_shows_the_map_and_the_outlines(result: Result, tmp_path: Path) -> None:
+    picture = result.plot()
+    rows, cols, _ = picture.pixels.shape
+    x0, y0, x1, y1 = result.grid.frame.bounds
+    for found in result.primitives:
+        vertex = found.primitive.outline()[0]
+        col, row = round((vertex[0] - x0) / (x1 - x0) * cols), round((y1 - vertex[1]) / (y1 - y0) * rows)
+        near = picture.pixels[row - 4 : row + 5, col - 4 : col + 5].reshape(-1, 3).astype(int)
+        assert np.abs(near - found.kind.row.color).sum(axis=1).min() < 60, found
+    picture.save(tmp_path / "a.png")
+    read = cv2.cvtColor(cv2.imread(str(tmp_path / "a.png")), cv2.COLOR_BGR2RGB)
+    assert np.array_equal(read, picture.pixels) and picture._repr_png_() == (tmp_path / "a.png").read_bytes()
+    with pytest.raises(prim.OutputError, match="choose another place"):
+        picture.save(tmp_path)
+
+
+def test_a_large_map_makes_a_picture_of_bounded_size(noisy_session: Session) -> None:
+    bounds = (-30.0, -2.0, 2.0, 2.0)
+    picture = prim.replay(noisy_session.path, bounds=bounds, detect=False).plot()
+    assert picture.pixels.shape == (125, 1000, 3)
+
+
+def test_poses_are_those_of_the_scans_that_have_one(result: Result, noisy_session: Session) -> None:
+    assert result.poses.source == "truth" and not result.poses.matched
+    assert result.poses.poses.shape == (noisy_session.scans, 3) and len(result.poses.stamps) == noisy_session.scans
+    pairs = list(prim.posed_scans(str(noisy_session.path)))
+    assert [scan.stamp for scan, _ in pairs] == result.poses.stamps.tolist()
+    assert np.array([(p.x, p.y, p.theta) for _, p in pairs]) == pytest.approx(result.poses.poses)
+
+
+def test_refinement_takes_guesses_of_any_detector(noisy_session: Session, quiet_session: Session) -> None:
+    grid = prim.replay(quiet_session.path, detect=False).grid
+    scans = list(prim.posed_scans(quiet_session.path))
+    truth = quiet_session.world.primitives
+    nowhere = prim.Primitive.of("circle", -0.9, 0.9, radius=0.05)
+    guesses = [prim.Primitive.of(p.kind, p.x + 0.008, p.y - 0.008, p.theta, **p.sizes) for p in truth]
+    refined = prim.refine([*guesses, nowhere], iter(scans), grid)
+    assert refined[-1] is None
+    for number, (found, true) in enumerate(zip(refined[:-1], truth, strict=True), 1):
+        assert found is not None and (found.id, found.kind) == (number, true.kind)
+        assert np.hypot(found.x - true.x, found.y - true.y) < 1e-3
+
+
+def test_several_mappers_give_a_result_each(noisy_session: Session, tmp_path: Path) -> None:
+    results = prim.replay_each(noisy_session.path, mapper="prob,det", save=tmp_path / "both.rrd", detect_every="end")
+    assert list(results) == ["prob", "det"] and (tmp_path / "both.rrd").stat().st_size > 10_000
+    for mapper, each in results.items():
+        alone = prim.replay(noisy_session.path, mapper=mapper)
+        assert np.array_equal(each.grid.probability, alone.grid.probability)
+        assert each.report["primitives"] == alone.report["primitives"]
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"resolution": 0}, "resolution is 0: it must be above 0"),
+        ({"detect": False, "refine": False}, "detect=False excludes detect_every, weights and refine=False"),
+        ({"standing_still": True, "pose": "tf"}, "standing_still=True excludes pose and odom_topic"),
+        ({"bounds": (0, 1)}, "bounds has 2 values"),
+        ({"laser_offset": (0, 1)}, "laser_offset has 2 values"),
+        ({"fuse": ["sonar"]}, "fuse sonar: sonar is no sensor"),
+        ({"n_scans": 0}, "n_scans is 0"),
+        ({"mapper": "det,prob"}, "replay_each"),
+        ({"maper": "det"}, "no parameter 'maper'"),
+        ({"detect_every": "often"}, "detect_every is often"),
+        ({"scan_topic": "/nothing"}, "no LaserScan on /nothing"),
+    ],
+)
+def test_errors_name_parameters(noisy_session: Session, options: dict[str, object], message: str) -> None:
+    with pytest.raises(prim.PrimError, match=message) as error:
+        prim.replay(noisy_session.path, **options)  # type: ignore[arg-type]
+    assert "--" not in str(error.value)
+
+
+def test_log_errors_keep_their_parts(tmp_path: Path) -> None:
+    (tmp_path / "cut.mcap").write_bytes(b"\x89MCAP0\r\n" + bytes(5))
+    with pytest.raises(prim.LogReadError, match="recover=True") as error:
+        list(prim.posed_scans(tmp_path / "cut.mcap"))
+    assert error.value.hint == "read what is left of it with recover=True" and error.value.what in str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"per_kind": (3, 1)}, "per_kind 3-1 is not a range"),
+        ({"kinds": ["pentagon"]}, "kinds pentagon"),
+        ({"movable": True}, "movable=True does not go with motion warp"),
+        ({"world": "w.json", "walls": False}, "world excludes size, walls=False"),
+        ({"size": (0, 1)}, "size is 0: it must be above 0"),
+        ({"motion": "fly"}, "motion fly"),
+        ({"colour": "red"}, "no parameter 'colour'"),
+    ],
+)
+def test_errors_of_recordings_name_parameters(tmp_path: Path, options: dict[str, object], message: str) -> None:
+    with pytest.raises(prim.UsageError, match=message):
+        prim.record(tmp_path / "a.mcap", **options)  # type: ignore[arg-type]
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_recording_is_that_of_the_command_line(tmp_path: Path) -> None:
+    from prim import console
+    from recorder import cli as recorder_cli
+
+    command = [str(tmp_path / "a.mcap"), "--seed", "4", "--rays", "90", "--stops", "3", "3", "--quiet"]
+    assert console.run(recorder_cli.app, "prim-record", command) == 0
+    prim.record(str(tmp_path / "b.mcap"), seed=4, rays=90, stops=(3, 3))
+    assert (tmp_path / "a.mcap").read_bytes() == (tmp_path / "b.mcap").read_bytes()
+
+
+def test_switches_are_the_keywords_that_are_true_or_false() -> None:
+    for keywords, switches in ((ReplayKeywords, SWITCHES), (RecordingKeywords, RECORDING_SWITCHES)):
+        hints = typing.get_type_hints(keywords)
+        assert {name for name, hint in hints.items() if bool in (hint, *typing.get_args(hint))} == switches
+
+
+def test_the_options_of_the_command_line_are_keywords() -> None:
+    """All but those that say where outputs go, and what is printed."""
+    outputs = {"logs", "save", "spawn", "connect", "serve", "no_viewer", "report", "map_output", "trajectory"}
+    printed = {"quiet", "verbose", "debug", "version"}
+    options = set(inspect.signature(cli.replay).parameters) - outputs - printed
+    assert {name.removeprefix("no_") for name in options} == set(ReplayKeywords.__annotations__)
