@@ -161,6 +161,6 @@ class ReplayOptions:
             ("--pose-noise", noise.position_std, noise.heading_std),
             ("--odom-noise", noise.odometry_translation_std, noise.odometry_rotation_std),
         ):
-            for value, unit, factor in ((metres, "m", 1.0), (radians, "degrees", math.degrees(1))):
-                if value is not None and not 0 < value < math.inf:
-                    raise UsageError(f"{name} has {factor * value:g} {unit}: both must be above 0")
+            given = [value for value in (metres, radians) if value is not None]
+            if not all(0 < value < math.inf for value in given):
+                raise UsageError(f"{name} is {' '.join(f'{value:g}' for value in given)}: both must be above 0")

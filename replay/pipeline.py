@@ -56,7 +56,9 @@ class Pipeline:
             The map, its poses and detections, and their evaluation where the log has ground truth.
         """
         if len(self.options.mappers) > 1:
-            raise UsageError(f"--mapper {self.options.mapper} names several: prim.replay_each() has a result for each")
+            raise UsageError(
+                f"--mapper {self.options.mapper} names several: prim.replay_each() has a result for each"
+            )
         return self.run_each()[0]
 
     def run_each(self) -> tuple[ReplayResult, ...]:

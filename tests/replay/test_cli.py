@@ -273,6 +273,33 @@ def test_a_truncated_log_is_refused_and_salvaged_with_exit_code_3(replay: Run, n
     assert (log["recovered"], log["messages_lost"], log["scans"]) == (True, None, noisy_session.scans)
 
 
+def test_several_mappers_leave_one_recording_and_a_report_each(replay: Run, noisy_session: Session) -> None:
+    code, out, err = replay(noisy_session.path, "--mapper", "det,forward", "--map", "m", "--trajectory", "t.tum")
+    assert (code, err) == (0, "")
+    assert {path.name for path in Path().iterdir()} == {
+        *("noisy.det-forward.rrd", "noisy.det.report.json", "noisy.forward.report.json", "t.tum"),
+        *(f"m.{mapper}.{suffix}" for mapper in ("det", "forward") for suffix in ("pgm", "yaml")),
+    }
+    header, units, det, forward = (line.split() for line in out.splitlines()[3:7])
+    assert header[:4] == ["mapper", "noise", "map", "F1"] and units[:2] == ["mm", "%"]
+    assert det[0] == "det" and forward[0] == "forward" and float(forward[1]) == pytest.approx(50, rel=0.1)
+    assert max(map(len, out.splitlines()[:7])) <= 80
+    assert {report_of(f"noisy.{mapper}.report.json")["map"]["mapper"] for mapper in ("det", "forward")} == {
+        *("det", "forward")
+    }
+
+
+def test_a_named_report_of_several_mappers_gets_their_names(replay: Run, noisy_session: Session) -> None:
+    options = ["--mapper", "det,prob", "--no-viewer", "--report", "a.json", "--no-detect"]
+    assert replay(noisy_session.path, *options)[0] == 0
+    assert {path.name for path in Path().iterdir()} == {"a.det.json", "a.prob.json"}
+
+
+def test_tracks_need_no_viewer(replay: Run, noisy_session: Session) -> None:
+    assert replay(noisy_session.path, "--no-viewer", "--detect-every", "5")[0] == 0
+    assert [path.name for path in Path().iterdir()] == ["noisy.prob.report.json"]
+
+
 @pytest.mark.parametrize(("noise", "expected"), [([], 0.05), (["--noise-std", "0.2"], 0.2)])
 @pytest.mark.parametrize("kind", [["--sensor-model", "gaussian"], ["--mapper", "forward"]])
 def test_the_range_noise_is_given_or_estimated(

@@ -152,6 +152,42 @@ def test_a_paced_selection_is_drawn_completely(noisy_session: Session, tmp_path:
     assert len(timed(rows_of(tmp_path / "a.rrd")["/map/scan"])) == 4
 
 
+@pytest.fixture(scope="module")
+def comparison(
+    noisy_session: Session, tmp_path_factory: pytest.TempPathFactory
+) -> tuple[Path, dict[str, ReplayResult]]:
+    path = tmp_path_factory.mktemp("rrd") / "several.rrd"
+    viewer = RerunViewer(ViewerOptions(save=path), announce=print)
+    results = Pipeline(noisy_session.path, ReplayOptions(mapper="det,prob,forward"), viewer).run_each()
+    return path, {result.options.mapper: result for result in results}
+
+
+def test_several_mappers_share_a_recording(comparison: tuple[Path, dict[str, ReplayResult]]) -> None:
+    path, results = comparison
+    rows = rows_of(path)
+    for mapper, result in results.items():
+        last = timed(rows[f"/{mapper}/map/grid"])[-1]
+        assert grid_values(last) == pytest.approx(expected_values(result.grid))
+        assert result.scores is not None and result.detections is not None and result.detections.errors is not None
+        scores = value(timed(rows[f"/{mapper}/scores"])[-1], "scalars")
+        assert scores[0] == pytest.approx(result.scores.occupied_f1)
+        f1 = [value(row, "scalars")[0] for row in timed(rows[f"/{mapper}/errors/found"])]
+        assert f1[-1] == pytest.approx(result.detections.errors.f1) and len(f1) > 8
+        assert len(timed(rows[f"/{mapper}/timing"])) == result.scans
+    assert len(timed(rows["/map/scan"])) == next(iter(results.values())).scans
+    assert "/map/grid" not in rows
+    summary = value(rows["/summary"][0], "text")[0]
+    assert "| mapper | noise, mm | map F1, % |" in summary and all(f"| {mapper} |" in summary for mapper in results)
+
+
+def test_errors_and_maps_are_there_from_the_first_scan_on(recording: tuple[Path, ReplayResult]) -> None:
+    path, result = recording
+    rows = rows_of(path)
+    looks = sorted({row["scan"] for row in timed(rows["/errors/found"])})
+    assert looks[0] == 0 and looks[-1] == result.scans - 1 and 8 <= len(looks) <= 12
+    assert timed(rows["/scores"])[0]["scan"] == 0 and timed(rows["/detections"])[0]["scan"] == 0
+
+
 def can_render() -> bool:
     """Whether a Vulkan driver is installed; rerun needs one to draw without a screen."""
     folders = ("/usr/share/vulkan/icd.d", "/etc/vulkan/icd.d")
@@ -161,10 +197,11 @@ def can_render() -> bool:
 
 
 @pytest.mark.skipif(not can_render(), reason="no Vulkan driver here to render with (mesa-vulkan-drivers)")
-def test_the_viewer_draws_every_view(recording: tuple[Path, ReplayResult], tmp_path: Path) -> None:
-    picture = tmp_path / "a.png"
+@pytest.mark.parametrize("recorded", ["recording", "comparison"])
+def test_the_viewer_draws_every_view(recorded: str, request: pytest.FixtureRequest, tmp_path: Path) -> None:
+    picture, rrd = tmp_path / "a.png", request.getfixturevalue(recorded)[0]
     done = subprocess.run(
-        [sys.executable, SCREENSHOT, recording[0], picture], capture_output=True, text=True, check=False, timeout=120
+        [sys.executable, SCREENSHOT, rrd, picture], capture_output=True, text=True, check=False, timeout=120
     )
     assert done.returncode == 0, done.stderr
     assert picture.read_bytes().startswith(b"\x89PNG")
