@@ -214,7 +214,7 @@ def yolo(
     seed: Annotated[int, typer.Option(metavar="N", help="Random seed of weights and augmentation.")] = 0,
     debug: Annotated[bool, typer.Option("--debug", help="Show tracebacks.")] = False,
 ) -> int:
-    """Train YOLOv5n, as ultralytics builds it, to detect primitives.
+    """Train YOLOv5u to detect primitives.
 
     An interrupted run is continued.
     """

@@ -11,6 +11,7 @@ from typing import Any
 
 from detect.evaluation.paper import ROWS, SHAPES, TABLE_1, TABLE_2, TEST_IMAGES, PaperRow
 from detect.evaluation.suites import READINGS, Case, PaperResult, ShippedResult, cases, write_text
+from prim.choices import MapperName
 
 BOX_METRICS = {"f1": "F1", "map50": "mAP 0.5", "map50_95": "mAP 0.5–0.95", "auc": "AUC"}
 """Columns of Table I: the fields of BoxMetrics and their titles."""
@@ -39,10 +40,10 @@ INTRODUCTION = f"""\
 
 Written by `prim-eval --suite paper`; seeds and settings are in `detect/evaluation/suites.py`. The paper's values are
 in brackets after ours. Training set: 500 maps; test set: 125 others; each of 2 x 2 m with 0 to 2 primitives of each
-shape. YOLOv5n: 32 epochs, batch size 32, SGD, learning rate 0.01; five CNNs: 20 epochs, batch size 128, Adam,
-learning rate 0.001. The paper initialises YOLO with weights trained on COCO, these networks with weights trained on
-synthetic drawings (`detect/training/drawings.py`). Maps of det and prob are rounded to occupied, free and unknown, as
-in the paper; maps of forward keep their probabilities.
+shape. YOLOv5n as ultralytics builds it (YOLOv5u): 32 epochs, batch size 32, SGD, learning rate 0.01; five CNNs: 20
+epochs, batch size 128, Adam, learning rate 0.001. The paper initialises YOLO with weights trained on COCO, these
+networks with weights trained on synthetic drawings (`detect/training/drawings.py`). Maps of det and prob are rounded
+to occupied, free and unknown, as in the paper; maps of forward keep their probabilities.
 
 Table I: F1 is the maximum over all score thresholds, at a box IoU of 0.5; AUC is the area under the precision-recall
 curve at that IoU; «all» is the mean over the shapes. Table II: mean absolute errors of the parameters estimated at
@@ -229,7 +230,7 @@ def _plot(results: Sequence[PaperResult], path: Path) -> None:
     readings = list(dict.fromkeys(case.reading for case, _, _ in results))
     figure = Figure(figsize=(11, 3.4 * len(readings)), layout="constrained")
     axes = figure.subplots(len(readings), 2, squeeze=False, sharey=True)
-    colours = {"det": "tab:orange", "prob": "tab:blue", "forward": "tab:green"}
+    colours = dict(zip(MapperName, ("tab:orange", "tab:blue", "tab:green"), strict=True))
     for line, reading in zip(axes, readings, strict=True):
         for axis, name in zip(line, ("map50", "f1"), strict=True):
             for mapper, colour in colours.items():
@@ -272,7 +273,8 @@ SHIPPED_COLUMNS = {
     "networks_f1": "networks: F1", "networks_map50": "mAP 0.5", "networks_map50_95": "0.5–0.95",
     "f1": "**refined**: F1", "map50": "mAP 0.5", "map50_95": "0.5–0.95",
     "weighted_map50": "weighted¹ 0.5", "weighted_map50_95": "0.5–0.95",
-    "position_mm": "position (mm)", "width_mm": "width (mm)", "height_mm": "height (mm)", "median_angle_deg": "angle (°)",
+    "position_mm": "position (mm)", "width_mm": "width (mm)", "height_mm": "height (mm)",
+    "median_angle_deg": "angle (°)",
 }  # fmt: skip
 """Columns of shipped.csv, and their titles in shipped.md."""
 
