@@ -41,7 +41,8 @@ bench-forward: .venv/installed
 	$(BIN)/python -m bench.calibrate check --update docs/forward.md
 
 bench-refine: .venv/installed
-	$(BIN)/python -m bench.refine --update docs/refine.md --short README.md
+	$(BIN)/python -m bench.refine --update docs/refine.md
+	$(BIN)/python -m bench.shipped --update README.md
 	$(BIN)/python -m bench.tracks --update docs/detect.md
 
 bench-poses: .venv/installed-dev

@@ -18,12 +18,13 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from bench.maps import session_of, update
+from bench.maps import FIRST_SEED, session_of, update
 from bench.sessions import Session, scans_with_poses
 from mapping.forward.level import Level, RangeNoise, RayStore
 from mapping.forward.mapper import ForwardMapper
 from mapping.grid import GridFrame
 from mapping.mapper import make_mapper
+from prim.choices import MapperName
 from prim.log import open_log
 from prim.scan import Scan
 from prim.se2 import Pose2D
@@ -32,7 +33,7 @@ from replay.mapping_stage import grid_frame_of_scans
 EVERY = 5
 CLIPS = (1e-5, 1e-4, 1e-3, 1e-2)
 NOISE_PASSES = 12
-SEEDS = range(5)
+SEEDS = range(FIRST_SEED, FIRST_SEED + 5)
 LOGS = (("csail.mcap", 0.05), ("pillars4.mcap", 0.02))
 
 Posed = list[tuple[Scan, Pose2D]]
@@ -93,7 +94,7 @@ def compare(scans: Posed, frame: GridFrame) -> dict[str, tuple[float, float]]:
     training = [item for i, item in enumerate(scans) if i % EVERY]
     held_out = rays_of(scans[::EVERY])
     maps = {}
-    for name in ("det", "prob"):
+    for name in (MapperName.DET.value, MapperName.PROB.value):
         mapper = make_mapper(name, frame.resolution, frame.bounds)
         for scan, pose in training:
             mapper.update(scan, pose)

@@ -2,9 +2,9 @@
 
     python -m bench.maps [--sessions 50] [--update docs/forward.md] [--short README.md]
 
-Sessions have seeds 0, 1, ...; at all noise levels they have the same worlds and poses. Beside the mappers stand two
-variants of prob: with the Gaussian sensor model and the true noise; and with its log-odds calibrated by a logistic
-regression for each noise level, on sessions of other seeds.
+Sessions have seeds from 50000, on which no option of a mapper was chosen; at all noise levels they have the same
+worlds and poses. Beside the mappers stand two variants of prob: with the Gaussian sensor model and the true noise;
+and with its log-odds calibrated by a logistic regression for each noise level, on sessions of other seeds.
 """
 
 from __future__ import annotations
@@ -21,12 +21,15 @@ from numpy.typing import NDArray
 from bench.sessions import Session, recorded
 from mapping.map_metrics import MapScores, map_scores
 from mapping.mapper import Mapper, make_mapper
+from prim.choices import MapperName, SensorModelName
 from recorder.sensors import Lidar
 from recorder.session import SessionOptions
 
 NOISE_LEVELS = (0.0, 0.05, 0.075, 0.1, 0.25, 0.375, 0.5)
-ROWS = ("det", "prob", "prob, calibrated", "prob, Gaussian", "forward")
+CALIBRATED, GAUSSIAN = "prob, calibrated", "prob, Gaussian"
+ROWS = (MapperName.DET, MapperName.PROB, CALIBRATED, GAUSSIAN, MapperName.FORWARD)
 COLUMNS = ("F1", "F1 within 3", "precision", "recall", "free", "AUC")
+FIRST_SEED = 50_000
 CALIBRATION_SEED, CALIBRATION_SESSIONS = 30_000, 8
 
 Scores = tuple[float | None, ...]
@@ -63,7 +66,7 @@ def calibration(noise_std: float) -> Line:
     for seed in range(CALIBRATION_SEED, CALIBRATION_SEED + CALIBRATION_SESSIONS):
         session = session_of(seed, noise_std)
         assert session.truth is not None
-        p = probability(make_mapper("prob", 0.01, session.frame.bounds), session)
+        p = probability(make_mapper(MapperName.PROB, 0.01, session.frame.bounds), session)
         used = session.truth.occupied | session.truth.free
         odds.append(odds_of(p[used]))
         truth.append(session.truth.occupied[used])
@@ -81,10 +84,10 @@ def scores_of(job: tuple[int, float, Line]) -> dict[str, Scores]:
     seed, noise_std, (intercept, slope) = job
     session = session_of(seed, noise_std)
     bounds = session.frame.bounds
-    maps = {name: probability(make_mapper(name, 0.01, bounds), session) for name in ("det", "prob", "forward")}
-    maps["prob, calibrated"] = 1 / (1 + np.exp(-(intercept + slope * odds_of(maps["prob"]))))
-    gaussian = make_mapper("prob", 0.01, bounds, "gaussian", max(noise_std, 1e-3))
-    maps["prob, Gaussian"] = probability(gaussian, session)
+    maps = {name.value: probability(make_mapper(name, 0.01, bounds), session) for name in MapperName}
+    maps[CALIBRATED] = 1 / (1 + np.exp(-(intercept + slope * odds_of(maps[MapperName.PROB]))))
+    gaussian = make_mapper(MapperName.PROB, 0.01, bounds, SensorModelName.GAUSSIAN, max(noise_std, 1e-3))
+    maps[GAUSSIAN] = probability(gaussian, session)
     assert session.truth is not None
     occupied, free = session.truth.occupied, session.truth.free
     return {
@@ -108,7 +111,7 @@ def median(values: list[float | None]) -> str:
     return f"{statistics.median(known):.3f}" if known else "–"
 
 
-def measure(sessions: int, first_seed: int = 0) -> dict[tuple[float, str], list[str]]:
+def measure(sessions: int, first_seed: int = FIRST_SEED) -> dict[tuple[float, str], list[str]]:
     """Compute the medians of each noise level and row.
 
     Args:
@@ -157,7 +160,7 @@ def update(path: Path, name: str, content: str) -> None:
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("--sessions", type=int, default=50)
-    parser.add_argument("--first-seed", type=int, default=0)
+    parser.add_argument("--first-seed", type=int, default=FIRST_SEED)
     parser.add_argument("--update", type=Path, help="the document that gets the whole table")
     parser.add_argument("--short", type=Path, help="the document that gets the short one")
     options = parser.parse_args()
@@ -165,4 +168,4 @@ if __name__ == "__main__":
     if options.update:
         update(options.update, "bench-maps", table(measured, ROWS, COLUMNS))
     if options.short:
-        update(options.short, "bench-maps", table(measured, ("det", "prob", "forward"), ("F1", "F1 within 3", "AUC")))
+        update(options.short, "bench-maps", table(measured, tuple(MapperName), ("F1", "F1 within 3", "AUC")))

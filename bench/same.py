@@ -25,9 +25,10 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
+from prim.choices import MapperName
+
 ROOT = Path(__file__).parents[1]
 DATA = ROOT.parent / "shared" / "data"
-MAPPERS = ("det", "prob", "forward")
 NOISE = (0.0, 0.05, 0.075, 0.1, 0.25, 0.375, 0.5)
 FIRST_SEED = 7_000
 
@@ -68,7 +69,7 @@ def commands(sessions: int, data: Path) -> Iterator[tuple[str, list[list[str]]]]
         record = ["prim-record", f"{name}.mcap", "--seed", str(FIRST_SEED + number), "--noise-std", str(noise)]
         replays = [
             _replay(f"{name}.mcap", f"{name}.{mapper}{suffix}", "--mapper", mapper, *refine)
-            for mapper in MAPPERS
+            for mapper in MapperName
             for suffix, refine in (("", []), (".unrefined", ["--no-refine"]))
         ]
         yield name, [[*record, "--rays", rays, "--quiet", *extra], *replays]
@@ -81,7 +82,7 @@ def commands(sessions: int, data: Path) -> Iterator[tuple[str, list[list[str]]]]
         laser = ["--laser-offset", "-0.032", "0", "0"]
         yield (
             "pillars4",
-            [_replay(str(data / "pillars4.mcap"), f"pillars4.{m}", "--mapper", m, *laser) for m in MAPPERS],
+            [_replay(str(data / "pillars4.mcap"), f"pillars4.{m}", "--mapper", m, *laser) for m in MapperName],
         )
     if (data / "csail.mcap").exists():
         yield (

@@ -214,7 +214,7 @@ def yolo(
     seed: Annotated[int, typer.Option(metavar="N", help="Random seed of weights and augmentation.")] = 0,
     debug: Annotated[bool, typer.Option("--debug", help="Show tracebacks.")] = False,
 ) -> int:
-    """Train YOLOv5 to detect primitives.
+    """Train YOLOv5u to detect primitives.
 
     An interrupted run is continued.
     """
@@ -324,6 +324,10 @@ def _evaluate(
         list[RecordingMode] | None,
         typer.Option(help="Of --suite shipped: a recording mode; may be repeated. [default: all]"),
     ] = None,
+    jobs: Annotated[
+        int | None,
+        typer.Option(metavar="N", help="Of --suite shipped: worker processes. [default: one per core]", min=1),
+    ] = None,
     output: Annotated[
         Path | None, typer.Option(metavar="FOLDER", help="The report's folder. [default: report, in FOLDER]")
     ] = None,
@@ -347,7 +351,7 @@ def _evaluate(
 
     folder = output or work / "report"
     if suite is SuiteName.PAPER:
-        given = {"--weights": weights, "--mapper": mapper, "--recorded": recorded}
+        given = {"--weights": weights, "--mapper": mapper, "--recorded": recorded, "--jobs": jobs}
         for name in (name for name, value in given.items() if value is not None):
             raise UsageError(f"{name} goes with --suite shipped")
         require_training_extra()
@@ -365,7 +369,7 @@ def _evaluate(
         mappers, modes = (
             [name.value for name in names] for names in (mapper or MapperName, recorded or RecordingMode)
         )
-        results = shipped.results() if so_far else shipped.run(sessions, mappers, modes)
+        results = shipped.results() if so_far else shipped.run(sessions, mappers, modes, jobs)
         written = write_shipped_report(results, folder)
     for path in written:
         announce(f"wrote: {path}")

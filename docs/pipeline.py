@@ -17,11 +17,11 @@ from bench.maps import session_of
 from detect.detection import Detection
 from detect.detector import Detector
 from mapping.grid import OccupancyGrid
-from mapping.mapper import make_mapper
+from mapping.mapper import MAPPERS, make_mapper
+from prim.choices import MapperName
 from prim.shapes import Primitive
 
 NOISE = {0.0: "n = 0", 0.05: "n = 0.05", 0.075: "n = 0.075", 0.1: "n = 0.1"}
-MAPPERS = ("det", "prob", "forward")
 SCALE, GAP, LABEL = 2, 8, 20
 TRUTH = (140, 140, 140)
 SEED = 40_002
@@ -38,7 +38,7 @@ def networks(suite: Path, mapper: str, noise_std: float) -> Detector:
     Returns:
         The detector.
     """
-    trained = 0 if noise_std == 0 and mapper != "prob" else 50
+    trained = 0 if noise_std == 0 and mapper != MapperName.PROB else 50
     return Detector.load(suite / "networks" / f"{mapper}-{trained}", mapper)
 
 

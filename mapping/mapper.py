@@ -95,6 +95,7 @@ def make_mapper(
     bounds: Bounds | None = None,
     sensor_model: str = "eq4",
     noise_std: float | None = None,
+    threads: int | None = None,
 ) -> Mapper:
     """Make a mapper by name, its kernels compiled.
 
@@ -105,6 +106,7 @@ def make_mapper(
         sensor_model: One of SENSOR_MODELS; other than ``eq4`` for ``prob`` alone.
         noise_std: Standard deviation of the range noise (m): ``forward`` estimates it where it is not given, the
             ``gaussian`` sensor model needs it.
+        threads: Number of threads of ``forward``; None: one for each available core. It does not change the map.
 
     Returns:
         The mapper.
@@ -116,22 +118,34 @@ def make_mapper(
     if sensor_model == "gaussian" and noise_std is None:
         raise UsageError("the Gaussian sensor model needs --noise-std")
     make = _FACTORIES[name]
-    warm_up = make(0.5, (-1.0, -1.0, 1.0, 1.0), noise_std)
+    warm_up = make(0.5, (-1.0, -1.0, 1.0, 1.0), noise_std, threads)
     warm_up.update(_WARM_UP_SCAN, Pose2D(0.1, 0.1))
     warm_up.grid()
     warm_up.finish()
-    return make(resolution, bounds, noise_std)
+    return make(resolution, bounds, noise_std, threads)
 
 
-def _make_deterministic(resolution: float, bounds: Bounds | None, noise_std: float | None) -> Mapper:
+def _make_deterministic(
+    resolution: float, bounds: Bounds | None, noise_std: float | None, threads: int | None
+) -> Mapper:
     return DeterministicMapper(resolution, bounds)
 
 
-_FACTORIES: Mapping[str, Callable[[float, Bounds | None, float | None], Mapper]] = {
+def _make_probabilistic(
+    resolution: float, bounds: Bounds | None, noise_std: float | None, threads: int | None
+) -> Mapper:
+    return ProbabilisticMapper(resolution, bounds, noise_std)
+
+
+def _make_forward(resolution: float, bounds: Bounds | None, noise_std: float | None, threads: int | None) -> Mapper:
+    return ForwardMapper(resolution, bounds, noise_std, threads=threads)
+
+
+_FACTORIES: Mapping[str, Callable[[float, Bounds | None, float | None, int | None], Mapper]] = {
     MapperName.DET: _make_deterministic,
-    MapperName.PROB: ProbabilisticMapper,
-    MapperName.FORWARD: ForwardMapper,
+    MapperName.PROB: _make_probabilistic,
+    MapperName.FORWARD: _make_forward,
 }
-"""How each mapper is made, of its resolution (m), bounds (m) and range noise (m)."""
+"""How each mapper is made, of its resolution (m), bounds (m), range noise (m) and number of threads."""
 
 _WARM_UP_SCAN = Scan(0, "", 0.0, 2.0, 0.1, 1.0, np.array([0.7, -np.inf, np.inf], dtype=np.float32))

@@ -1,8 +1,10 @@
 """Evaluation on recorded sessions, as a replay processes them: mapped, detected, refined by the log's rays.
 
-The networks are evaluated by the protocol of YOLOv5's validation: every candidate of every kind counts with its
-score, those below the thresholds too. Refinement is evaluated alike: every primitive fitted to rays counts as each
-kind with that kind's posterior probability, and with a share of it where it was rejected in the end.
+Average precision is computed in two ways. By the field's definition (COCO, PASCAL VOC) the boxes of what is reported
+count, each with its kind and score. The other counts all candidates: of the networks those of every kind with their
+scores, below the thresholds too, by the protocol of YOLOv5's validation; of refinement, by a rule of our own, every
+primitive fitted to rays as each kind with that kind's posterior probability, and with a share of it where it was
+rejected in the end.
 """
 
 from __future__ import annotations
@@ -58,13 +60,15 @@ class SessionScore:
     """Detections of a session compared with its ground truth.
 
     Attributes:
-        scored: Candidates and true boxes, for each image.
+        scored: All candidates and true boxes, for each image.
+        reported: The boxes of the detections, and true boxes.
         pairs: Detections that count as found, each with its true primitive.
         detections: Number of all detections.
         truths: Number of all true primitives.
     """
 
     scored: tuple[ScoredBoxes, ...]
+    reported: ScoredBoxes
     pairs: tuple[PrimitivePair, ...]
     detections: int
     truths: int
@@ -76,7 +80,7 @@ class SessionScore:
         """Compare detections with the ground truth.
 
         Args:
-            scored: Candidates and true boxes.
+            scored: All candidates and true boxes.
             detections: Detections.
             truth: True primitives.
 
@@ -84,7 +88,8 @@ class SessionScore:
             The comparison.
         """
         found = [detection.primitive for detection in detections]
-        return cls(tuple(scored), tuple(matched_pairs(found, truth)), len(found), len(truth))
+        reported = reported_primitives(detections, truth)
+        return cls(tuple(scored), reported, tuple(matched_pairs(found, truth)), len(found), len(truth))
 
 
 def evaluate_session(
@@ -103,7 +108,7 @@ def evaluate_session(
     """
     world, scans = simulate_session(session_options(options, seed))
     frame = map_frame(world, options.resolution)
-    grid = map_scans(mapper, scans, options.resolution, frame.bounds)
+    grid = map_scans(mapper, scans, options.resolution, frame.bounds, threads=1)
     detector = _load_detector(weights, mapper)
     detections = detector.detect(grid)
     refined, _ = refine_detections(detections, scans, grid, None, 1)
@@ -121,35 +126,45 @@ def evaluate_session(
     )
 
 
-def evaluate_sessions(seeds: Sequence[int], options: DatasetOptions, mapper: str, weights: Path) -> dict[str, Any]:
-    """Evaluate sessions on all cores.
+def evaluate_sessions(
+    seeds: Sequence[int], options: DatasetOptions, mapper: str, weights: Path, jobs: int | None = None
+) -> dict[str, Any]:
+    """Evaluate sessions in processes of one thread each; their number does not change the results.
 
     Args:
         seeds: Seeds of the sessions.
         options: How they are recorded.
         mapper: Name of the mapper.
         weights: Folder of the detector's weights.
+        jobs: Number of processes; None: one for each available core.
 
     Returns:
         Results as they are stored: ``networks`` (alone) and ``refined``, each as :func:`summarize_sessions`.
     """
     evaluate = partial(evaluate_session, options=options, mapper=mapper, weights=weights)
-    with ProcessPoolExecutor(cores()) as pool:
-        scores = list(pool.map(evaluate, seeds, chunksize=4))
+    with ProcessPoolExecutor(jobs or cores()) as pool:
+        scores = list(pool.map(evaluate, seeds))
     networks, refined = zip(*scores, strict=True)
     return {"networks": summarize_sessions(networks), "refined": summarize_sessions(refined)}
 
 
 def summarize_sessions(scores: Sequence[SessionScore]) -> dict[str, Any]:
-    """Compute metrics over sessions: ``boxes`` (BoxMetrics), ``errors`` (ParameterErrors), ``found``.
+    """Compute metrics over sessions.
 
-    The first two by kind and for ``all``; ``found`` is precision, recall and F1.
+    Args:
+        scores: The sessions' scores.
+
+    Returns:
+        ``boxes`` (BoxMetrics of all candidates), ``reported`` (BoxMetrics of the detections) and ``errors``
+        (ParameterErrors), each by kind and for ``all``; ``found``: precision, recall and F1 of the detections.
     """
     pairs = [pair for score in scores for pair in score.pairs]
     metrics = score_boxes([scored for score in scores for scored in score.scored])
+    reported = score_boxes([score.reported for score in scores])
     detections, truths = sum(score.detections for score in scores), sum(score.truths for score in scores)
     return {
         "boxes": {name: asdict(row) for name, row in metrics.items()},
+        "reported": {name: asdict(row) for name, row in reported.items()},
         "errors": {name: asdict(row) for name, row in parameter_errors(pairs).items()},
         "found": precision_recall_f1(len(pairs), detections, truths),
     }
@@ -158,6 +173,20 @@ def summarize_sessions(scores: Sequence[SessionScore]) -> dict[str, Any]:
 @lru_cache(maxsize=4)
 def _load_detector(weights: Path, mapper: str) -> Detector:
     return Detector.load(weights, mapper, 1)
+
+
+def reported_primitives(detections: Sequence[Detection], truth: Sequence[Primitive]) -> ScoredBoxes:
+    """Return the boxes around the outlines of detections, each with its kind and its score.
+
+    Args:
+        detections: Detections.
+        truth: True primitives.
+
+    Returns:
+        The boxes and true boxes, in cells of 10 mm.
+    """
+    candidates = [(detection.primitive, detection.primitive.kind, detection.score) for detection in detections]
+    return _scored_boxes(candidates, truth)
 
 
 def scored_primitives(refined: Detections, truth: Sequence[Primitive]) -> ScoredBoxes:
@@ -172,14 +201,19 @@ def scored_primitives(refined: Detections, truth: Sequence[Primitive]) -> Scored
     """
     rejected = [rejection.fitted for rejection in refined.rejected if rejection.fitted is not None]
     candidates = [
-        (primitive_box(detection.primitive), KINDS.index(kind), weight * probability)
+        (detection.primitive, kind, weight * probability)
         for detections, weight in ((refined.found, 1.0), (rejected, REJECTED_WEIGHT))
         for detection in detections
         for kind, probability in _kind_probabilities(detection).items()
         if weight * probability >= MIN_PROBABILITY
     ]
-    boxes = np.array([box for box, _, _ in candidates], np.float32).reshape(-1, 4)
-    kinds = np.array([kind for _, kind, _ in candidates], np.intp)
+    return _scored_boxes(candidates, truth)
+
+
+def _scored_boxes(candidates: Sequence[tuple[Primitive, Kind, float]], truth: Sequence[Primitive]) -> ScoredBoxes:
+    """Return the boxes of candidates (each with the kind that it counts as, and a score) and of true primitives."""
+    boxes = np.array([primitive_box(primitive) for primitive, _, _ in candidates], np.float32).reshape(-1, 4)
+    kinds = np.array([KINDS.index(kind) for _, kind, _ in candidates], np.intp)
     scores = np.array([score for _, _, score in candidates], np.float32)
     true_box = np.array([primitive_box(primitive) for primitive in truth], np.float32).reshape(-1, 4)
     true_kind = np.array([KINDS.index(primitive.kind) for primitive in truth], np.intp)

@@ -247,13 +247,20 @@ class ShippedSuite:
     def __init__(self, work: Path, weights: Path, announce: Announce) -> None:
         self.work, self.weights, self.announce = work, weights, announce
 
-    def run(self, sessions: int, mappers: Sequence[str] = MAPPERS, modes: Sequence[str] = ()) -> list[ShippedResult]:
+    def run(
+        self,
+        sessions: int,
+        mappers: Sequence[str] = MAPPERS,
+        modes: Sequence[str] = (),
+        jobs: int | None = None,
+    ) -> list[ShippedResult]:
         """Evaluate what is missing.
 
         Args:
             sessions: Number of sessions of each condition.
             mappers: Names of the mappers.
             modes: Modes of recording (RecordingMode); all where none is named.
+            jobs: Number of processes; None: one for each available core.
 
         Returns:
             All results so far.
@@ -268,17 +275,17 @@ class ShippedSuite:
         for mapper in available:
             for condition in conditions(sessions):
                 if not modes or condition.name in modes:
-                    self._evaluate(condition, sessions, mapper)
+                    self._evaluate(condition, sessions, mapper, jobs)
         return self.results()
 
-    def _evaluate(self, condition: RecordingCondition, sessions: int, mapper: str) -> None:
+    def _evaluate(self, condition: RecordingCondition, sessions: int, mapper: str, jobs: int | None) -> None:
         """Evaluate one condition, unless that was done with these weights."""
         path, weights = self._result_path(condition, sessions, mapper), self.weights / mapper
         if path.exists() and path.stat().st_mtime >= (weights / DETECTOR_FILE).stat().st_mtime:
             return
         with announce_duration(path.stem, self.announce):
             seeds = [seed for _, seed in session_seeds(condition.options)]
-            result = evaluate_sessions(seeds, condition.options, mapper, weights)
+            result = evaluate_sessions(seeds, condition.options, mapper, weights, jobs)
         path.parent.mkdir(parents=True, exist_ok=True)
         write_text(path, json.dumps(result, indent=1))
 

@@ -11,6 +11,7 @@ from typing import Any
 
 from detect.evaluation.paper import ROWS, SHAPES, TABLE_1, TABLE_2, TEST_IMAGES, PaperRow
 from detect.evaluation.suites import READINGS, Case, PaperResult, ShippedResult, cases, write_text
+from prim.choices import MapperName
 
 BOX_METRICS = {"f1": "F1", "map50": "mAP 0.5", "map50_95": "mAP 0.5–0.95", "auc": "AUC"}
 """Columns of Table I: the fields of BoxMetrics and their titles."""
@@ -39,10 +40,10 @@ INTRODUCTION = f"""\
 
 Written by `prim-eval --suite paper`; seeds and settings are in `detect/evaluation/suites.py`. The paper's values are
 in brackets after ours. Training set: 500 maps; test set: 125 others; each of 2 x 2 m with 0 to 2 primitives of each
-shape. YOLOv5n: 32 epochs, batch size 32, SGD, learning rate 0.01; five CNNs: 20 epochs, batch size 128, Adam,
-learning rate 0.001. The paper initialises YOLO with weights trained on COCO, these networks with weights trained on
-synthetic drawings (`detect/training/drawings.py`). Maps of det and prob are rounded to occupied, free and unknown, as
-in the paper; maps of forward keep their probabilities.
+shape. YOLOv5n as ultralytics builds it (YOLOv5u): 32 epochs, batch size 32, SGD, learning rate 0.01; five CNNs: 20
+epochs, batch size 128, Adam, learning rate 0.001. The paper initialises YOLO with weights trained on COCO, these
+networks with weights trained on synthetic drawings (`detect/training/drawings.py`). Maps of det and prob are rounded
+to occupied, free and unknown, as in the paper; maps of forward keep their probabilities.
 
 Table I: F1 is the maximum over all score thresholds, at a box IoU of 0.5; AUC is the area under the precision-recall
 curve at that IoU; «all» is the mean over the shapes. Table II: mean absolute errors of the parameters estimated at
@@ -229,7 +230,7 @@ def _plot(results: Sequence[PaperResult], path: Path) -> None:
     readings = list(dict.fromkeys(case.reading for case, _, _ in results))
     figure = Figure(figsize=(11, 3.4 * len(readings)), layout="constrained")
     axes = figure.subplots(len(readings), 2, squeeze=False, sharey=True)
-    colours = {"det": "tab:orange", "prob": "tab:blue", "forward": "tab:green"}
+    colours = dict(zip(MapperName, ("tab:orange", "tab:blue", "tab:green"), strict=True))
     for line, reading in zip(axes, readings, strict=True):
         for axis, name in zip(line, ("map50", "f1"), strict=True):
             for mapper, colour in colours.items():
@@ -260,15 +261,25 @@ boxes, as in the paper's tables (F1: the maximum over all score thresholds; mAP 
 thresholds too, by the protocol of YOLOv5's validation).
 
 The columns after «refined» evaluate the primitives of a replay, refined with the log's rays. F1 is that of the
-reported primitives (correct kind, polygon IoU of at least 0.5). mAP is that of the boxes around refined outlines, by
-a rule of our own in place of a score: each primitive counts as every kind with that kind's posterior probability, and
-one that was fitted but rejected with a tenth of it. Place (the distance of the centroids), width and height are mean
-errors over the true positives, the angle's error is the median."""
+reported primitives (correct kind, polygon IoU of at least 0.5). mAP is the field's (COCO: precision interpolated at
+101 recalls, mean over the kinds): the boxes around the outlines of the reported primitives, each with its kind and
+score. Position (the distance of the centroids), width and height are mean errors over the true positives, the
+angle's error is the median. «–»: not measured, or no true positive.
 
-SHIPPED_COLUMNS = (
-    "networks_f1", "networks_map50", "networks_map50_95", "f1", "map50", "map50_95", "position_mm", "width_mm",
-    "height_mm", "median_angle_deg",
-)  # fmt: skip
+¹ Weighted mAP is a rule of our own, not to be compared with mAP elsewhere: each primitive counts as every kind with
+that kind's posterior probability, and one that was fitted but rejected counts too, with a tenth of it."""
+
+SHIPPED_COLUMNS = {
+    "networks_f1": "networks: F1", "networks_map50": "mAP 0.5", "networks_map50_95": "0.5–0.95",
+    "f1": "**refined**: F1", "map50": "mAP 0.5", "map50_95": "0.5–0.95",
+    "weighted_map50": "weighted¹ 0.5", "weighted_map50_95": "0.5–0.95",
+    "position_mm": "position (mm)", "width_mm": "width (mm)", "height_mm": "height (mm)",
+    "median_angle_deg": "angle (°)",
+}  # fmt: skip
+"""Columns of shipped.csv, and their titles in shipped.md."""
+
+SHIPPED_ERRORS = ("position_mm", "width_mm", "height_mm", "median_angle_deg")
+"""Those that are errors; the others are shares."""
 
 
 def write_shipped_report(results: Sequence[ShippedResult], folder: Path) -> list[Path]:
@@ -286,29 +297,63 @@ def write_shipped_report(results: Sequence[ShippedResult], folder: Path) -> list
     """
     folder.mkdir(parents=True, exist_ok=True)
     markdown, table = folder / "shipped.md", folder / "shipped.csv"
-    boxes = ("F1", "mAP 0.5", "0.5–0.95")
-    names = [f"networks: {boxes[0]}", *boxes[1:], f"**refined**: {boxes[0]}", *boxes[1:]]
-    names += ["place (mm)", "width (mm)", "height (mm)", "angle (°)"]
-    lines = [SHIPPED_INTRODUCTION, "", f"| recorded | noise (mm) | mapper | sessions | {' | '.join(names)} |"]
-    lines.append("|---|---:|---|" + "---:|" * (1 + len(names)))
+    titles = SHIPPED_COLUMNS.values()
+    lines = [SHIPPED_INTRODUCTION, "", f"| recorded | noise (mm) | mapper | sessions | {' | '.join(titles)} |"]
+    lines.append("|---|---:|---|" + "---:|" * (1 + len(titles)))
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(("recorded", "noise_std_m", "mapper", "sessions", *SHIPPED_COLUMNS))
     for condition, mapper, sessions, result in results:
         values = _shipped_values(result)
-        cells = [_cell(value, None, 3 if k < 6 else 2) for k, value in enumerate(values)]
+        cells = [_cell(value, None, 2 if name in SHIPPED_ERRORS else 3) for name, value in values.items()]
         lines.append(f"| {condition.name} | {condition.noise_mm} | {mapper} | {sessions} | {' | '.join(cells)} |")
-        texts = ("" if value is None else f"{value:.5g}" for value in values)
+        texts = ("" if value is None else f"{value:.5g}" for value in values.values())
         writer.writerow((condition.name, condition.noise_mm / 1000, mapper, sessions, *texts))
     write_text(markdown, "\n".join(lines) + "\n")
     write_text(table, text.getvalue())
     return [markdown, table]
 
 
-def _shipped_values(result: dict[str, Any]) -> list[float | None]:
-    """Return the values of one row, in the order of SHIPPED_COLUMNS."""
-    networks, refined = (result[name]["boxes"].get("all", {}) for name in ("networks", "refined"))
-    errors = result["refined"]["errors"].get("all")
-    mean_errors = [_in_units(errors, name) for name in ("position", "width", "height", "median_angle")]
-    alone = [networks.get(name) for name in ("f1", "map50", "map50_95")]
-    return [*alone, result["refined"]["found"][2], refined.get("map50"), refined.get("map50_95"), *mean_errors]
+def shipped_summary(results: Sequence[ShippedResult], mode: str, mapper: str) -> str:
+    """Return a short table of one mode of recording and one mapper.
+
+    Args:
+        results: Results of the shipped weights' suite.
+        mode: One of RecordingMode.
+        mapper: Name of the mapper.
+
+    Returns:
+        A Markdown table with a row for each noise; F1 of the networks is that of what they report, as of refinement.
+    """
+    chosen = ("map50", "map50_95", *SHIPPED_ERRORS)
+    titles = ("noise", "sessions", "F1: networks", "**refined**", *(SHIPPED_COLUMNS[name] for name in chosen))
+    lines = [f"| {' | '.join(titles)} |", "|---|" + "---:|" * (len(titles) - 1)]
+    for condition, name, sessions, result in results:
+        if (condition.name, name) == (mode, mapper):
+            values = _shipped_values(result)
+            cells = [f"{result[part]['found'][2]:.3f}" for part in ("networks", "refined")]
+            cells += [_cell(values[key], None, 2 if key in SHIPPED_ERRORS else 3) for key in chosen]
+            lines.append(f"| {condition.noise_mm} mm | {sessions} | {' | '.join(cells)} |")
+    return "\n".join(lines)
+
+
+def _shipped_values(result: dict[str, Any]) -> dict[str, float | None]:
+    """Return the values of one row by the names of SHIPPED_COLUMNS; None: not measured, or no true positive."""
+    networks, refined = result["networks"], result["refined"]
+    errors = refined["errors"].get("all")
+    alone, weighted = (part["boxes"].get("all", {}) for part in (networks, refined))
+    reported = refined.get("reported", {}).get("all", {})
+    return {
+        "networks_f1": alone.get("f1"),
+        "networks_map50": alone.get("map50"),
+        "networks_map50_95": alone.get("map50_95"),
+        "f1": refined["found"][2],
+        "map50": reported.get("map50"),
+        "map50_95": reported.get("map50_95"),
+        "weighted_map50": weighted.get("map50"),
+        "weighted_map50_95": weighted.get("map50_95"),
+        "position_mm": _in_units(errors, "position"),
+        "width_mm": _in_units(errors, "width"),
+        "height_mm": _in_units(errors, "height"),
+        "median_angle_deg": _in_units(errors, "median_angle"),
+    }

@@ -101,14 +101,12 @@ class KindPosterior:
         covariance: (K, K).
         log_evidence: Nats.
         cost: Negative log-likelihood at the mean (nats), by :class:`SplitCost`.
-        effective_samples: Kish's effective sample size of the tempered weights.
     """
 
     mean: FloatArray
     covariance: FloatArray
     log_evidence: float
     cost: float
-    effective_samples: float
 
 
 def importance_sample(
@@ -141,7 +139,7 @@ def importance_sample(
         cost = split.costs(points @ jacobian.T)
         log_weight = -cost / sensor.dispersion - log_density + np.log(np.diag(lower)).sum()
         if not np.isfinite(log_weight).any():
-            return KindPosterior(at, spread, -math.inf, fit.cost, 0.0)
+            return KindPosterior(at, spread, -math.inf, fit.cost)
         weight = np.exp(log_weight - log_weight.max())
         last = count == len(rounds)
         share = _tempered(weight, options.min_effective_last if last else options.min_effective, options)
@@ -155,7 +153,6 @@ def importance_sample(
         covariance + np.diag(floor**2) / 100,
         log_evidence,
         float(split.costs((jacobian @ mean)[None])[0]),
-        float(1 / (share**2).sum()),
     )
 
 

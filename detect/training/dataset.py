@@ -38,6 +38,7 @@ from prim.log.messages import POSE_TYPE, SCAN_TOPIC, TRUE_POSE_TOPIC, decode_pos
 from prim.scan import Scan
 from prim.se2 import Pose2D, Trajectory
 from prim.shapes import Kind, Primitive
+from prim.threads import cores
 from prim.world import Bounds, World
 from recorder.sensors import Lidar
 from recorder.session import SessionOptions, record_session
@@ -176,7 +177,7 @@ def make_dataset(
     """
     _prepare_folder(folder, options)
     missing = [job for job in session_seeds(options) if not _done(folder, *job).exists()]
-    with ProcessPoolExecutor(workers or len(os.sched_getaffinity(0))) as pool:
+    with ProcessPoolExecutor(workers or cores()) as pool:
         futures = [pool.submit(_make_session, folder, options, split, seed) for split, seed in missing]
         for count, future in enumerate(as_completed(futures), start=1):
             future.result()
@@ -215,7 +216,9 @@ def _make_session(folder: Path, options: DatasetOptions, split: str, seed: int) 
     session = session_options(options, seed)
     world, scans = simulate_session(session)
     frame = map_frame(world, options.resolution)
-    grids = {mapper: map_scans(mapper, scans, options.resolution, frame.bounds) for mapper in options.mappers}
+    grids = {
+        mapper: map_scans(mapper, scans, options.resolution, frame.bounds, threads=1) for mapper in options.mappers
+    }
     for number, tile in enumerate(tile_frames(frame)):
         primitives = primitives_in_tile(world.primitives, tile)
         name = f"{seed:06d}_{number}"
@@ -276,7 +279,13 @@ def read_scans(path: Path) -> list[tuple[Scan, Pose2D]]:
     return [(scan, Pose2D(*pose)) for scan, pose in zip(scans, at.tolist(), strict=True)]
 
 
-def map_scans(mapper: str, scans: Sequence[tuple[Scan, Pose2D]], resolution: float, bounds: Bounds) -> OccupancyGrid:
+def map_scans(
+    mapper: str,
+    scans: Sequence[tuple[Scan, Pose2D]],
+    resolution: float,
+    bounds: Bounds,
+    threads: int | None = None,
+) -> OccupancyGrid:
     """Map scans with known poses.
 
     Args:
@@ -284,13 +293,14 @@ def map_scans(mapper: str, scans: Sequence[tuple[Scan, Pose2D]], resolution: flo
         scans: Scans and the laser's poses, map frame.
         resolution: Side of a cell (m).
         bounds: Bounds of the map (m).
+        threads: Number of threads; None: one for each available core. It does not change the map.
 
     Returns:
         The finished map.
     """
-    made = make_mapper(mapper, resolution, bounds)
+    made = make_mapper(mapper, resolution, bounds, threads=threads)
     for scan, pose in scans:
-        made.update(scan, pose)
+        made.accumulate(scan, pose)
     return made.finish()
 
 

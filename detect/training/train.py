@@ -1,4 +1,4 @@
-"""Training of YOLOv5 with ultralytics and of the parameter networks (detect.training.model), with checkpoints.
+"""Training of YOLOv5u with ultralytics and of the parameter networks (detect.training.model), with checkpoints.
 
 Needs the extra ``[train]`` (torch, ultralytics); a replay does not import this.
 """
@@ -293,7 +293,7 @@ def _resume(output: Path, settings: dict[str, Any], network: Any, optimizer: Any
 
 @dataclass(frozen=True)
 class YoloOptions:
-    """Training of YOLOv5 with ultralytics; the fields are keys of the run's ``asked.json``.
+    """Training of YOLOv5u with ultralytics; the fields are keys of the run's ``asked.json``.
 
     Attributes:
         model: Architecture, a yaml of ultralytics.
@@ -342,7 +342,7 @@ YOLO_PRESETS = {
 
 
 def train_yolo(data: Path, mapper: str, output: Path, options: YoloOptions) -> Path:
-    """Train YOLOv5, or continue an interrupted run.
+    """Train YOLOv5u, or continue an interrupted run.
 
     Images are translated, scaled and flipped by ultralytics' defaults, with ``mosaic`` and ``turn`` on request;
     colours are not augmented, since a map's channels are no colours.

@@ -17,8 +17,6 @@ if TYPE_CHECKING:
     from replay.poses.fusion import Fusion
 
 FUSED = PoseSourceName.FUSED.value
-SOURCES = tuple(name.value for name in PoseSourceName)
-"""The sources of poses that can be asked for."""
 
 STILL = "still"
 """The source of poses of a robot that stands still."""
@@ -71,7 +69,7 @@ class LaserPoses:
     """The laser's pose at each of N scans.
 
     Attributes:
-        source: One of SOURCES but auto, or STILL.
+        source: One of PoseSourceName but auto, or STILL.
         origin: The topics or frames that the poses come from, for people.
         poses: (N, 3) x, y (m), heading (rad) in the map frame.
         valid: Which scans (N,) lie within the time of the poses.

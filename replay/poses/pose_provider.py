@@ -83,7 +83,7 @@ class PoseProvider:
 
         Args:
             scans: When the scans were taken.
-            source: One of laser_poses.SOURCES. ``auto`` means ``odom`` where an ``odom_topic`` was given; else it
+            source: One of PoseSourceName. ``auto`` means ``odom`` where an ``odom_topic`` was given; else it
                 takes the ground truth, else a tf chain to ``map``, else what can be fused with a GPS or a compass,
                 else any tf chain, else odometry.
 

@@ -18,7 +18,15 @@ from detect.evaluation import suites, tables
 from detect.evaluation.evaluate import evaluate_detector
 from detect.evaluation.modes import RecordingMode
 from detect.evaluation.paper import ROWS, SHAPES, TABLE_1, TABLE_2
-from detect.evaluation.sessions import REJECTED_WEIGHT, evaluate_session, scored_primitives, summarize_sessions
+from detect.evaluation.sessions import (
+    REJECTED_WEIGHT,
+    SessionScore,
+    evaluate_session,
+    evaluate_sessions,
+    reported_primitives,
+    scored_primitives,
+    summarize_sessions,
+)
 from detect.networks.weights import KIND_NAMES, SHIPPED, ModelCard
 from detect.networks.yolo import KINDS
 from detect.training.dataset import DatasetOptions, bounding_box, load_samples, make_dataset
@@ -165,6 +173,7 @@ def sessions_json(value: float) -> dict[str, Any]:
     """Made-up results of detect.evaluation.sessions."""
     metrics = {
         "boxes": {"all": {"f1": value, "map50": value, "map50_95": value}},
+        "reported": {"all": {"f1": value, "map50": value / 2, "map50_95": value / 3}},
         "errors": {},
         "found": (1, 1, value),
     }
@@ -174,17 +183,43 @@ def sessions_json(value: float) -> dict[str, Any]:
 def test_the_shipped_weights_report(tmp_path: Path) -> None:
     results = [(condition, "forward", 500, sessions_json(0.9)) for condition in suites.conditions(500)]
     markdown, table = tables.write_shipped_report(results, tmp_path)
-    assert "| warped | 250 | forward | 500 | 0.900 | 0.900 | 0.900 | 0.900 | 0.900 |" in markdown.read_text()
+    row = "| warped | 250 | forward | 500 | 0.900 | 0.900 | 0.900 | 0.900 | 0.450 | 0.300 | 0.900 | 0.900 | – |"
+    assert row in markdown.read_text()
     lines = list(csv.DictReader(table.open()))
     assert len(lines) == 7 + 4 * 3 and {line["recorded"] for line in lines} == set(RecordingMode)
     assert lines[0]["position_mm"] == "" and lines[0]["networks_f1"] == "0.9"
+    assert (lines[0]["map50"], lines[0]["weighted_map50"]) == ("0.45", "0.9")
+
+
+def test_results_without_the_mean_average_precision_of_what_is_reported_have_a_dash(tmp_path: Path) -> None:
+    earlier = sessions_json(0.9)
+    del earlier["refined"]["reported"]
+    condition = next(suites.conditions(500))
+    markdown, table = tables.write_shipped_report([(condition, "forward", 500, earlier)], tmp_path)
+    assert "| 500 | 0.900 | 0.900 | 0.900 | 0.900 | – | – | 0.900 | 0.900 | – |" in markdown.read_text()
+    assert next(csv.DictReader(table.open()))["map50"] == ""
+    assert "| 0 mm | 500 | 0.900 | 0.900 | – | – |" in tables.shipped_summary(
+        [(condition, "forward", 500, earlier)], RecordingMode.WARPED, "forward"
+    )
+
+
+def test_the_summary_is_of_one_mode_and_one_mapper() -> None:
+    results = [
+        (condition, mapper, 24, sessions_json(0.5))
+        for condition in suites.conditions(24)
+        for mapper in ("det", "prob")
+    ]
+    lines = tables.shipped_summary(results, RecordingMode.DRIVEN, "det").splitlines()
+    assert [line.split(" | ")[0] for line in lines[2:]] == ["| 50 mm", "| 250 mm", "| 500 mm"]
 
 
 def test_the_shipped_suite_evaluates_what_is_missing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """It reports for each row the results with most sessions."""
     calls: list[tuple[int, str]] = []
 
-    def evaluate_sessions(seeds: list[int], options: object, mapper: str, weights: Path) -> dict[str, Any]:
+    def evaluate_sessions(
+        seeds: list[int], options: object, mapper: str, weights: Path, jobs: int | None
+    ) -> dict[str, Any]:
         calls.append((len(seeds), mapper))
         return sessions_json(len(seeds) / 10)
 
@@ -211,6 +246,28 @@ def test_a_session_is_evaluated_from_its_seed(mapper: str) -> None:
     assert largest[1] < 0.001 < largest[0]
     scores = summarize_sessions([refined])
     assert scores["boxes"]["all"]["map50"] == pytest.approx(1, abs=0.01) and scores["found"] == (1, 1, 1)
+
+
+def test_the_number_of_processes_does_not_change_the_results() -> None:
+    options = DatasetOptions(sizes=(0, 3), seed=7, rays=(120,), stops=(4,), noise_stds=(0.05,))
+    one, two = (evaluate_sessions([7, 8, 9], options, "forward", SHIPPED / "forward", jobs) for jobs in (1, 2))
+    assert one == two and one["refined"]["found"][2] > 0.5
+
+
+def test_what_is_reported_counts_with_its_kind_and_its_score() -> None:
+    """The mean average precision of the field: neither further kinds nor rejected primitives count."""
+    square = Primitive(Kind.SQUARE, 0.0, 0.0, 0.0, (0.2,))
+    detection = Detection(
+        replace(square, kind=Kind.RECTANGLE, size=(0.2, 0.19)),
+        *(0.7, (0, 0, 0, 0), np.zeros((0, 0), np.uint8), None),
+        {Kind.RECTANGLE: 0.7, Kind.SQUARE: 0.3},
+    )
+    boxes = reported_primitives([detection], [square]).boxes
+    assert [KINDS[kind] for kind in boxes.kind] == [Kind.RECTANGLE] and boxes.score == pytest.approx([0.7])
+    assert boxes.box[0] == pytest.approx([-10, -9.5, 10, 9.5])
+    score = SessionScore.compare([scored_primitives(Detections((detection,), ()), [square])], [detection], [square])
+    scores = summarize_sessions([score])
+    assert scores["boxes"]["all"]["map50"] == pytest.approx(1) and scores["reported"]["all"]["map50"] == 0
 
 
 def test_each_kind_counts_by_its_probability() -> None:

@@ -36,7 +36,7 @@ def test_sizes_that_agree_give_their_evidence_to_the_special_case(kind: Kind, sp
 
     def posterior(kind: Kind, log_evidence: float) -> KindPosterior:
         mean = np.array([0.0, 0.0, *([0.0] if kind.has_angle else []), 0.2, 0.2][: len(kind.parameters)])
-        return KindPosterior(mean, np.eye(len(mean)), log_evidence, 0.0, 1.0)
+        return KindPosterior(mean, np.eye(len(mean)), log_evidence, 0.0)
 
     sampled = {kind: posterior(kind, -3.0), special: posterior(special, -2.0)}
     fits = [FakeFit(special)]
