@@ -161,6 +161,8 @@ class ReplayOptions:
             ("--pose-noise", noise.position_std, noise.heading_std),
             ("--odom-noise", noise.odometry_translation_std, noise.odometry_rotation_std),
         ):
-            given = [value for value in (metres, radians) if value is not None]
-            if not all(0 < value < math.inf for value in given):
-                raise UsageError(f"{name} is {' '.join(f'{value:g}' for value in given)}: both must be above 0")
+            if metres is None or radians is None:
+                continue
+            if not (0 < metres < math.inf and 0 < radians < math.inf):
+                what = f"{metres:g} m and {math.degrees(radians):g} degrees"
+                raise UsageError(f"{name} is {what}: both must be above 0")

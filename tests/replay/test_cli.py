@@ -465,8 +465,8 @@ def test_matched_scans_correct_odometry(replay: Run, driven_session: Path, optio
         (["--pose", "odom", "--fuse", "gps"], "do not go with --pose odom"),
         (["--pose", "tf", "--gps-topic", "/gps"], "do not go with --pose tf"),
         (["--pose", "odom", "--pose-noise", 0.1, 1], "go with --pose fused or with --match-scans"),
-        (["--pose-noise", 0, 1], "--pose-noise is 0 1: both must be above 0"),
-        (["--odom-noise", 0.1, "nan"], "--odom-noise is 0.1 nan: both must be above 0"),
+        (["--pose-noise", 0, 1], "--pose-noise is 0 m and 1 degrees: both must be above 0"),
+        (["--odom-noise", 0.1, "nan"], "--odom-noise is 0.1 m and nan degrees: both must be above 0"),
         (["--standing-still", "--match-scans"], "excludes --match-scans"),
     ],
 )
