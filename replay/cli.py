@@ -6,12 +6,12 @@ import dataclasses
 import math
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from itertools import takewhile
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
@@ -30,6 +30,8 @@ if TYPE_CHECKING:
 PARTLY_LOST = 3
 """The exit code when part of a log could not be read."""
 
+REPORT_SUFFIX = ".report.json"
+
 app = typer.Typer(add_completion=False, rich_markup_mode=None)
 
 
@@ -43,8 +45,12 @@ def _show_version(wanted: bool) -> None:
 def replay(
     logs: Annotated[list[Path], typer.Argument(metavar="LOG...", help="MCAP logs, or folders of ROS 2 bags.")],
     mapper: Annotated[
-        MapperName, typer.Option(help="Deterministic, probabilistic (log-odds), or forward (maximum likelihood).")
-    ] = MapperName.PROB,
+        str,
+        typer.Option(
+            metavar="det|prob|forward[,...]",
+            help="Deterministic, probabilistic (log-odds), or forward (maximum likelihood); several side by side.",
+        ),
+    ] = MapperName.PROB.value,
     pose: Annotated[PoseSourceName, typer.Option(help="The source of poses.")] = PoseSourceName.AUTO,
     resolution: Annotated[float, typer.Option(metavar="M", help="Side of a cell, metres.")] = 0.01,
     bounds: Annotated[str, typer.Option(metavar="auto or X0 Y0 X1 Y1", help="The map's bounds, metres.")] = "auto",
@@ -111,7 +117,11 @@ def replay(
     ] = None,
     no_detect: Annotated[bool, typer.Option("--no-detect", help="Skip the detection of primitives.")] = False,
     detect_every: Annotated[
-        int | None, typer.Option(metavar="N", help="Detect primitives every N scans as well as at the end.")
+        str | None,
+        typer.Option(
+            metavar="N|end",
+            help="Detect primitives every N scans and at the end, or at the end only. [default: about 10 times]",
+        ),
     ] = None,
     no_refine: Annotated[
         bool, typer.Option("--no-refine", help="Keep the networks' estimates: no fit to the rays.")
@@ -146,17 +156,18 @@ def replay(
 ) -> int:
     """Replay MCAP logs of a 2D LiDAR through an occupancy mapper and show the result in rerun.
 
-    Each log leaves a recording and a report in this folder: LOG.MAPPER.rrd and LOG.MAPPER.report.json.
+    Each log leaves a recording and a report in this folder: LOG.MAPPER.rrd and LOG.MAPPER.report.json. Several
+    mappers share a recording, and each has a report.
     """
     from replay.options import ReplayOptions
     from replay.selection import Selection
     from replay.viewing.protocol import ViewerOptions
 
     viewer = ViewerOptions(save, spawn, connect, serve, live=rate is not None)
-    if no_viewer and (viewer != ViewerOptions(live=viewer.live) or map_every or detect_every):
-        raise UsageError("--no-viewer excludes --save, --spawn, --connect, --serve, --map-every and --detect-every")
+    if no_viewer and (viewer != ViewerOptions(live=viewer.live) or map_every):
+        raise UsageError("--no-viewer excludes --save, --spawn, --connect, --serve and --map-every")
     options = ReplayOptions(
-        mapper=mapper.value,
+        mapper=mapper,
         sensor_model=sensor_model.value,
         noise_std=noise_std,
         pose=pose.value,
@@ -174,7 +185,7 @@ def replay(
         rate=rate,
         map_every=map_every,
         detect=not no_detect,
-        detect_every=detect_every,
+        detect_every=_parse_interval(detect_every),
         refine=not no_refine,
         weights=weights,
         recover=recover,
@@ -192,28 +203,48 @@ class OutputFiles:
     map: Path | None
     trajectory: Path | None
 
-    @property
-    def paths(self) -> list[Path]:
-        """The paths of all files."""
-        from replay.exports import map_files
-
-        single_files = (self.recording, self.report, self.trajectory)
-        return [path for path in single_files if path] + (list(map_files(self.map)) if self.map else [])
-
-    def named_after(self, log: Path, mapper: str, with_recording: bool) -> OutputFiles:
-        """Name the files that have no name yet after a log; they are written to the current folder.
+    def named_after(self, log: Path, mappers: Sequence[str], with_recording: bool) -> OutputFiles:
+        """Name the recording and the report, where they have no name yet, after a log, in the current folder.
 
         Args:
             log: The log.
-            mapper: The mapper.
+            mappers: The mappers.
             with_recording: Whether a recording is wanted.
 
         Returns:
             The files of this log.
         """
-        stem = f"{log.resolve().name.removesuffix('.part').removesuffix('.mcap')}.{mapper}"
-        recording = self.recording or (Path(f"{stem}.rrd") if with_recording else None)
-        return dataclasses.replace(self, recording=recording, report=self.report or Path(f"{stem}.report.json"))
+        stem = log.resolve().name.removesuffix(".part").removesuffix(".mcap")
+        name = f"{stem}.{'-'.join(mappers)}.rrd"
+        recording = self.recording or (Path(name) if with_recording else None)
+        report = self.report or Path(
+            f"{stem}.{mappers[0]}.report.json" if len(mappers) == 1 else f"{stem}.report.json"
+        )
+        return dataclasses.replace(self, recording=recording, report=report)
+
+    def of_mapper(self, mapper: str, mappers: Sequence[str]) -> OutputFiles:
+        """Return the files of one mapper: of several, the names of its report and its map hold its own.
+
+        Args:
+            mapper: The mapper.
+            mappers: All mappers of the replay.
+
+        Returns:
+            The files, of which all mappers share the recording and the trajectory.
+        """
+        if len(mappers) == 1:
+            return self
+        report, stem = (path and _with_name_of(mapper, path) for path in (self.report, self.map))
+        return dataclasses.replace(self, report=report, map=stem)
+
+    def paths(self, mappers: Sequence[str]) -> list[Path]:
+        """Return the paths of all files of some mappers."""
+        from replay.exports import map_files
+
+        of_each = [self.of_mapper(mapper, mappers) for mapper in mappers]
+        maps = [path for files in of_each if files.map for path in map_files(files.map)]
+        paths = [self.recording, *(files.report for files in of_each), *maps, self.trajectory]
+        return [path for path in paths if path]
 
 
 @dataclass(frozen=True)
@@ -225,6 +256,12 @@ class Verbosity:
     debug: bool
 
 
+def _with_name_of(mapper: str, path: Path) -> Path:
+    """Return a path with a mapper's name before its suffix, as in OUT.det.json or LOG.det.report.json."""
+    suffix = REPORT_SUFFIX if path.name.endswith(REPORT_SUFFIX) else path.suffix
+    return path.with_name(f"{path.name.removesuffix(suffix)}.{mapper}{suffix}")
+
+
 def _replay_logs(
     logs: Sequence[Path],
     options: ReplayOptions,
@@ -234,8 +271,8 @@ def _replay_logs(
 ) -> int:
     """Replay logs one after the other; return the exit code of the worst."""
     with_recording = viewer is not None and not viewer.watched
-    jobs = {log: files.named_after(log, options.mapper, with_recording) for log in logs}
-    _check_distinct(logs, list(jobs.values()))
+    jobs = {log: files.named_after(log, options.mappers, with_recording) for log in logs}
+    _check_distinct(logs, [path for outputs in jobs.values() for path in outputs.paths(options.mappers)])
     codes = []
     for log, outputs in jobs.items():
         shown = None if viewer is None else dataclasses.replace(viewer, save=outputs.recording)
@@ -248,9 +285,9 @@ def _replay_logs(
     return next((code for code in (console.FAILED, console.USAGE, PARTLY_LOST) if code in codes), 0)
 
 
-def _check_distinct(logs: Sequence[Path], jobs: Sequence[OutputFiles]) -> None:
+def _check_distinct(logs: Sequence[Path], outputs: Sequence[Path]) -> None:
     """Raise UsageError where a file would be written twice, or over a log."""
-    files = [path.resolve() for outputs in jobs for path in outputs.paths]
+    files = [path.resolve() for path in outputs]
     inputs = {log.resolve() for log in logs}
     if len(inputs) < len(logs):
         raise UsageError("a log is named twice")
@@ -268,17 +305,18 @@ def _replay_log(
     from replay.exports import check_writable
     from replay.pipeline import Pipeline
 
-    for path in outputs.paths:
+    for path in outputs.paths(options.mappers):
         check_writable(path)
     viewer = _make_viewer(shown)
     with console.progress_bar("scans", verbosity.quiet) as progress:
-        result = Pipeline(log, options, viewer, progress).run()
-    _write_outputs(result, outputs)
+        results = Pipeline(log, options, viewer, progress).run_each()
+    for result in results:
+        _write_outputs(result, outputs.of_mapper(result.options.mapper, options.mappers))
     if not verbosity.quiet:
-        _print_result(result, outputs, verbosity.verbose)
+        _print_results(results, outputs, verbosity.verbose)
     if shown is not None and shown.serve:
         _keep_serving()
-    return PARTLY_LOST if result.lost else 0
+    return PARTLY_LOST if results[0].lost else 0
 
 
 def _make_viewer(shown: ViewerOptions | None) -> Viewer | None:
@@ -302,14 +340,18 @@ def _write_outputs(result: ReplayResult, outputs: OutputFiles) -> None:
         write_trajectory(outputs.trajectory, result)
 
 
-def _print_result(result: ReplayResult, outputs: OutputFiles, verbose: bool) -> None:
+def _print_results(results: Sequence[ReplayResult], outputs: OutputFiles, verbose: bool) -> None:
     """Print notes, rejected candidates if ``verbose``, the table, and where the outputs are."""
-    for note in result.notes:
+    from replay.result import distinct_notes
+
+    for note in distinct_notes(results):
         typer.echo(f"note: {note}", err=True)
     if verbose:
-        _print_rejected(result)
-    _print_table(result, verbose)
-    typer.echo("wrote: " + ", ".join(str(path) for path in outputs.paths))
+        for result in results:
+            _print_rejected(result)
+    _print_tables(results, verbose)
+    mappers = [result.options.mapper for result in results]
+    typer.echo("wrote: " + ", ".join(str(path) for path in outputs.paths(mappers)))
     if outputs.recording:
         typer.echo(f"open:  rerun {outputs.recording}")
 
@@ -322,22 +364,33 @@ def _print_rejected(result: ReplayResult) -> None:
         typer.echo(f"rejected: {what}: {rejection.reason}", err=True)
 
 
-def _print_table(result: ReplayResult, verbose: bool) -> None:
-    """Print the table of the result; with the time of each stage if verbose."""
+def _print_tables(results: Sequence[ReplayResult], verbose: bool) -> None:
+    """Print the table of one mapper's result, or how several compare; with the time of each stage if verbose."""
+    from replay.report import comparison_table, shared_rows, summary_rows
+
+    several = len(results) > 1
+    _print_table(shared_rows(results) if several else summary_rows(results[0]))
+    if several:
+        names, units, *rows = comparison_table(results)
+        _print_table(rows, [f"{name}\n{unit}" for name, unit in zip(names, units, strict=True)])
+    if verbose:
+        for result in results:
+            name = f"{result.options.mapper}: " if several else "  "
+            _print_table([(f"{name}{stage}", f"{s:.3f} s") for stage, s in result.seconds.items() if s])
+
+
+def _print_table(rows: Iterable[Sequence[str]], header: Sequence[str] = ()) -> None:
+    """Print rows of cells, text or numbers under a header where there is one."""
     from rich.console import Console
     from rich.table import Table
     from rich.text import Text
 
-    from replay.report import summary_rows
-
-    rows = Table(show_header=False, box=None, pad_edge=False)
-    for name, value in summary_rows(result):
-        rows.add_row(Text(name), Text(value))
-    if verbose:
-        for name, seconds in result.seconds.items():
-            if seconds:
-                rows.add_row(Text(f"  {name}"), Text(f"{seconds:.3f} s"))
-    Console(highlight=False, soft_wrap=True).print(rows)
+    table = Table(show_header=bool(header), box=None, pad_edge=False)
+    for name in header:
+        table.add_column(name, justify="left" if name == header[0] else "right")
+    for row in rows:
+        table.add_row(*map(Text, row))
+    Console(highlight=False, soft_wrap=True).print(table)
 
 
 def _keep_serving() -> None:
@@ -402,6 +455,16 @@ def _parse_bounds(text: str) -> Bounds | None:
         raise UsageError(f"--bounds {text}: give auto, or four numbers X0 Y0 X1 Y1")
     x0, y0, x1, y1 = (float(number) for number in numbers)
     return x0, y0, x1, y1
+
+
+def _parse_interval(text: str | None) -> int | Literal["end"] | None:
+    """Parse a number of scans or «end»; None stays None. Raises UsageError."""
+    if text is None or text == "end":
+        return text  # type: ignore[return-value]
+    try:
+        return int(text)
+    except ValueError:
+        raise UsageError(f"--detect-every {text}: give a number of scans, or end") from None
 
 
 def _is_number(text: str) -> bool:

@@ -4,16 +4,21 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Final, Literal
 
 import numpy as np
 
 from mapping.mapper import check_mapper
+from prim.choices import MapperName, SensorModelName
 from prim.errors import UsageError
 from prim.se2 import Pose2D
 from prim.world import Bounds
 from replay.poses.fusion_options import FusionInputs, SensorNoise
 from replay.poses.laser_poses import FUSED
 from replay.selection import Selection
+
+END: Final = "end"
+"""The value of ``detect_every`` for one detection, after the last scan."""
 
 MAX_OFFSET = 1000.0
 """The largest plausible distance (m) of a laser from its robot's origin; set by hand."""
@@ -24,7 +29,7 @@ class ReplayOptions:
     """How a log is replayed.
 
     Attributes:
-        mapper: The mapper: «det», «prob» or «forward».
+        mapper: The mapper: «det», «prob» or «forward»; or several, separated by commas.
         sensor_model: The inverse sensor model of «prob»: «eq4» or «gaussian».
         noise_std: The range noise (m); None to estimate it where it is needed.
         pose: The source of poses (:class:`prim.choices.PoseSourceName`).
@@ -43,8 +48,8 @@ class ReplayOptions:
         map_every: N to show the map after the scans at positions 0, N, 2N and so on of the selection; None to choose
             the interval.
         detect: Whether primitives are detected.
-        detect_every: N to detect primitives after the scans at positions N - 1, 2N - 1 and so on of the selection,
-            and at the end; None for the end only.
+        detect_every: N to detect primitives after the first scan, after every N scans, and at the end; «end» for the
+            end only; None for about ten times where the replay is shown, else the end only.
         refine: Whether detections are refined with the rays.
         weights: The weights of the detector; None for those that come with prim.
         recover: Whether what is left of a damaged log is read.
@@ -53,7 +58,7 @@ class ReplayOptions:
         UsageError: A value is impossible, or two exclude each other.
     """
 
-    mapper: str = "det"
+    mapper: str = "prob"
     sensor_model: str = "eq4"
     noise_std: float | None = None
     pose: str = "auto"
@@ -71,13 +76,13 @@ class ReplayOptions:
     rate: float | None = None
     map_every: int | None = None
     detect: bool = True
-    detect_every: int | None = None
+    detect_every: int | Literal["end"] | None = None
     refine: bool = True
     weights: Path | None = None
     recover: bool = False
 
     def __post_init__(self) -> None:
-        check_mapper(self.mapper, self.sensor_model, self.noise_std)
+        self._check_mappers()
         if not (0 < self.resolution < np.inf):
             raise UsageError(f"--resolution is {self.resolution:g}: it must be above 0")
         if self.bounds is not None and not (self.bounds[0] < self.bounds[2] and self.bounds[1] < self.bounds[3]):
@@ -88,11 +93,49 @@ class ReplayOptions:
             raise UsageError(f"--max-range is {self.max_range:g}: it must be above 0")
         if self.map_every is not None and self.map_every < 1:
             raise UsageError(f"--map-every is {self.map_every}: it must be at least 1")
-        if self.detect_every is not None and self.detect_every < 1:
-            raise UsageError(f"--detect-every is {self.detect_every}: it must be at least 1")
+        every = self.detect_every
+        if every not in (None, END) and not (isinstance(every, int) and every >= 1):
+            raise UsageError(f"--detect-every is {every}: it must be a number of scans, at least 1, or «{END}»")
         if not self.detect and (self.detect_every or self.weights or not self.refine):
             raise UsageError("--no-detect excludes --detect-every, --weights and --no-refine")
         self._check_poses()
+
+    @property
+    def mappers(self) -> tuple[str, ...]:
+        """The names of the mappers."""
+        return tuple(name.strip() for name in self.mapper.split(","))
+
+    def by_mapper(self) -> tuple[ReplayOptions, ...]:
+        """Return the options of each mapper alone: its name, and of sensor model and range noise what it takes."""
+        if len(self.mappers) == 1:
+            return (self,)
+        return tuple(
+            replace(self, mapper=name, sensor_model=model, noise_std=noise_std)
+            for name, model, noise_std in self._mapper_settings()
+        )
+
+    def _mapper_settings(self) -> list[tuple[str, str, float | None]]:
+        """Return each mapper's name, sensor model and range noise: those given where it takes them."""
+        settings = []
+        for name in self.mappers:
+            model = self.sensor_model if name == MapperName.PROB else SensorModelName.EQ4.value
+            takes_noise = name == MapperName.FORWARD or model == SensorModelName.GAUSSIAN
+            settings.append((name, model, self.noise_std if takes_noise else None))
+        return settings
+
+    def _check_mappers(self) -> None:
+        settings = self._mapper_settings()
+        for setting in settings:
+            check_mapper(*setting)
+        if len(set(self.mappers)) < len(self.mappers):
+            raise UsageError(f"--mapper {self.mapper}: a mapper is named twice")
+        if self.weights is not None and len(self.mappers) > 1:
+            raise UsageError("--weights goes with one mapper: networks read the maps of the one they are trained on")
+        _, models, noises = zip(*settings, strict=True)
+        if self.sensor_model not in models:
+            check_mapper(self.mappers[0], self.sensor_model)
+        if self.noise_std not in noises:
+            check_mapper(self.mappers[0], noise_std=self.noise_std)
 
     def _check_poses(self) -> None:
         if self.standing_still and (self.pose != "auto" or self.odom_topic):

@@ -1,55 +1,28 @@
-"""Replay: a log through a mapper, scan by scan, evaluated and shown as it goes."""
+"""Replay: a log through one mapper or several, scan by scan, evaluated and shown as it goes."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import replace
-from functools import partial
 from pathlib import Path
-from typing import NamedTuple
 
-from mapping.grid import GridFrame, OccupancyGrid
-from mapping.map_metrics import MapScores
-from prim.errors import LogReadError, WorldError
+from mapping.grid import GridFrame
+from prim.errors import UsageError, WorldError
 from prim.log import open_log
 from prim.log.source import LogSource
 from prim.scan import PosedScan
-from replay.detection_stage import DetectionResult, DetectionStage, NoDetection, make_detection_stage
+from replay.branch import Branch, Outcome
 from replay.ground_truth import GroundTruth
-from replay.mapping_stage import MappingStage, choose_grid_frame, make_replay_mapper
-from replay.notes import pluralize
+from replay.localization import Localization, localize, pose_scans
+from replay.mapping_stage import choose_grid_frame
 from replay.options import ReplayOptions
-from replay.posed_scans import PosedScanOptions, PosedScans, ScanLog
-from replay.poses.fusion_options import FusionInputs, SensorNoise
-from replay.poses.laser_poses import FUSED, LaserPoses
-from replay.poses.pose_provider import PoseProvider
+from replay.posed_scans import PosedScans, ScanLog
 from replay.replay_evaluator import ReplayEvaluator
-from replay.result import ReplayResult
+from replay.result import ReplayResult, distinct_notes
 from replay.timing import RatePacer, StageTimer
 from replay.viewing.protocol import NullViewer, Scene, Viewer
 
-MAP_SNAPSHOTS = 50
-"""By default the map is shown about this many times; set by hand."""
-
-MAP_SNAPSHOT_CELLS = 40_000_000
-"""By default no more cells than this are shown in all snapshots together: one byte each in a recording."""
-
 Progress = Callable[[int, int], None]
-
-
-class Outcome(NamedTuple):
-    """What a replay comes to.
-
-    Attributes:
-        grid: The map of all scans.
-        scores: Its scores; None without ground truth.
-        detections: The primitives in it; None where detection was skipped.
-    """
-
-    grid: OccupancyGrid
-    scores: MapScores | None
-    detections: DetectionResult | None
 
 
 class Pipeline:
@@ -77,39 +50,46 @@ class Pipeline:
         self._notes: list[str] = []
 
     def run(self) -> ReplayResult:
-        """Replay the log, from the file to the result.
+        """Replay the log by one mapper, from the file to the result; see :meth:`run_each`.
 
         Returns:
             The map, its poses and detections, and their evaluation where the log has ground truth.
+        """
+        if len(self.options.mappers) > 1:
+            raise UsageError(f"--mapper {self.options.mapper} names several: run_each() has a result for each")
+        return self.run_each()[0]
+
+    def run_each(self) -> tuple[ReplayResult, ...]:
+        """Replay the log by each of the mappers side by side, from the file to the results.
+
+        Returns:
+            A result for each mapper, in the order in which the options name them.
 
         Raises:
             LogReadError: The log cannot be read, or lacks what the replay needs.
             UsageError: The options do not fit together or do not fit the log.
-            WeightsError: The detector's weights cannot be used, be they named or those that come with prim.
+            WeightsError: The weights that the options name cannot be used.
             OutputError: The viewer's recording cannot be created.
             RecordingError: The viewer's recording could not be written in full, at the end.
         """
         with self._abandoned_on_failure(), open_log(self.path, recover=self.options.recover) as log:
             scans = self._read_scans(log)
             truth = self._read_truth(log)
-            poses, true_poses = self._estimate_poses(log, scans)
-            posed_scans = self._posed_scans(scans, poses)
+            poses, true_poses, _ = self._localize(log, scans)
+            posed_scans = pose_scans(scans, poses, self.options, self._timer)
             frame = choose_grid_frame(posed_scans, self.options, truth.world if truth else None)
             evaluator = ReplayEvaluator(frame, truth, poses, true_poses)
-            detection = self._make_detection_stage(frame, evaluator, poses)
-            mapping = self._make_mapping_stage(frame, posed_scans, detection)
-            self._begin_viewer(frame, posed_scans, mapping, detection, evaluator)
+            branches = self._branches(frame, posed_scans, evaluator)
+            self._begin_viewer(frame, posed_scans, branches, evaluator)
             for posed in self._paced(posed_scans):
-                seconds = mapping.update(posed)
                 evaluator.update(posed)
-                self._show_detections(posed, detection.update(posed, mapping.mapper))
-                self._show_scan(posed, seconds, evaluator)
-                self._show_map(posed, mapping.snapshot(posed.position), evaluator)
-            grid = mapping.finish()
-            outcome = Outcome(grid, evaluator.score(grid), detection.finish(grid, posed_scans))
-            result = self._result(log, posed_scans, mapping, detection, evaluator, outcome)
-            self._show_result(result)
-        return result
+                self._show_scan(posed, evaluator)
+                for branch in branches:
+                    branch.update(posed)
+            outcomes = [branch.finish() for branch in branches]
+            results = self._results(log, posed_scans, evaluator, branches, outcomes)
+            self._show_results(results)
+        return results
 
     def _read_scans(self, log: LogSource) -> ScanLog:
         """Find the scans that are to be replayed."""
@@ -125,78 +105,19 @@ class Pipeline:
                 self._notes.append(f"the map is not scored: {error}")
                 return None
 
-    def _estimate_poses(self, log: LogSource, scans: ScanLog) -> tuple[LaserPoses, LaserPoses | None]:
-        """Return the poses of the laser that the replay uses, matched where that is asked for, and the true ones."""
+    def _localize(self, log: LogSource, scans: ScanLog) -> Localization:
+        """Find the poses of the laser, matched where that is asked for, and the true ones."""
         with self._timer.stage("localize"):
-            poses, true_poses = self._look_up_poses(log, scans)
-            if self.options.match_scans:
-                poses = self._match_scans(scans, poses)
-        return poses, true_poses
+            localization = localize(log, scans, self.options, self._timer)
+        self._notes += localization.notes
+        return localization
 
-    def _look_up_poses(self, log: LogSource, scans: ScanLog) -> tuple[LaserPoses, LaserPoses | None]:
-        """Return the laser's poses by the source that is asked for, and the true ones where the log has them."""
-        options = self.options
-        provider = PoseProvider(log, options.odom_topic, options.laser_offset, options.fuse)
-        times = scans.times if options.deskew else replace(scans.times, sweep=0)
-        if options.standing_still:
-            return provider.stationary_poses(times), None
-        poses = provider.laser_poses(times, options.pose)
-        fuse = replace(options.fuse, noise=SensorNoise()) if options.match_scans else options.fuse
-        if fuse != FusionInputs() and poses.source != FUSED:
-            self._notes.append(f"nothing is fused, since there are poses on {poses.origin}: give --pose fused")
-        if poses.source == "truth":
-            return poses, poses
-        if not provider.has_truth:
-            return poses, None
-        try:
-            return poses, provider.laser_poses(times, "truth")
-        except LogReadError as error:
-            self._notes.append(f"the poses are not held against the truth: {error.what}")
-            return poses, None
-
-    def _match_scans(self, scans: ScanLog, poses: LaserPoses) -> LaserPoses:
-        """Correct the poses by matching every scan with a map of the scans."""
-        from replay.poses.scan_matching import match_scans  # when it is needed: a replay without it starts faster
-
-        options = self.options
-        posed = partial(self._posed_scans, scans)
-        return match_scans(
-            poses, scans.stamps, posed, options.resolution, options.noise_std, options.fuse.noise, options.bounds
-        )
-
-    def _posed_scans(self, scans: ScanLog, poses: LaserPoses) -> PosedScans:
-        """Give the scans their poses, and cut them where the laser moved by half a cell."""
-        options = PosedScanOptions(self.options.resolution / 2, self.options.max_range)
-        return PosedScans(scans, poses, options, self._timer)
-
-    def _make_detection_stage(
-        self, frame: GridFrame, evaluator: ReplayEvaluator, poses: LaserPoses
-    ) -> DetectionStage | NoDetection:
-        """Make the stage that detects primitives, in the map so far and in the final one."""
-        truth = evaluator.comparable_truth
-        return make_detection_stage(self.options, frame, truth, poses.frame_covariance, self._timer)
-
-    def _make_mapping_stage(
-        self, frame: GridFrame, posed_scans: PosedScans, detection: DetectionStage | NoDetection
-    ) -> MappingStage:
-        """Make the stage that maps scan by scan; note where the map is too large to be shown often."""
-        interval, notes = self._snapshot_interval(frame, len(posed_scans.scan_log))
-        self._notes += notes
-        mapper = make_replay_mapper(posed_scans, frame, self.options, self._timer)
-        return MappingStage(mapper, interval, interval is not None or detection.streaming, self._timer)
-
-    def _snapshot_interval(self, frame: GridFrame, scans: int) -> tuple[int | None, list[str]]:
-        """Choose every how many scans the map is shown, so that a recording stays small; and what to note of that."""
-        if not self.viewer.shows:
-            return None, []
-        if self.options.map_every:
-            return self.options.map_every, []
-        snapshots = min(MAP_SNAPSHOTS, max(1, MAP_SNAPSHOT_CELLS // (frame.rows * frame.cols)))
-        note = (
-            f"the map is large and shown {pluralize(snapshots, 'time')} along the way: more often with --map-every, "
-            "or with a coarser --resolution"
-        )
-        return max(1, -(-scans // snapshots)), [note] if snapshots < min(MAP_SNAPSHOTS, scans) else []
+    def _branches(self, frame: GridFrame, posed_scans: PosedScans, evaluator: ReplayEvaluator) -> list[Branch]:
+        """Make a branch for each mapper: it maps, detects primitives, and shows both."""
+        return [
+            Branch(options, frame, posed_scans, evaluator, self.viewer, self._timer)
+            for options in self.options.by_mapper()
+        ]
 
     def _paced(self, posed_scans: PosedScans) -> Iterator[PosedScan]:
         """Iterate over the scans, no faster than at the rate that is asked for, and report the progress."""
@@ -207,25 +128,19 @@ class Pipeline:
             self._progress(posed.position + 1, len(posed_scans.scan_log))
 
     def _begin_viewer(
-        self,
-        frame: GridFrame,
-        posed_scans: PosedScans,
-        mapping: MappingStage,
-        detection: DetectionStage | NoDetection,
-        evaluator: ReplayEvaluator,
+        self, frame: GridFrame, posed_scans: PosedScans, branches: Sequence[Branch], evaluator: ReplayEvaluator
     ) -> None:
         """Describe the replay to the viewer before the first scan."""
         scans, poses = posed_scans.scan_log, posed_scans.poses
-        detects = isinstance(detection, DetectionStage)
         scene = Scene(
             log=scans.path.name,
-            mapper=self.options.mapper,
+            mappers=self.options.mappers,
             bounds=frame.bounds,
             has_scores=evaluator.scores_maps,
             has_pose_errors=evaluator.compares_poses,
-            has_visits=mapping.mapper.counts_visits,
-            has_detections=detects,
-            has_errors=detects and evaluator.scores_maps,
+            counting=tuple(branch.mapper for branch in branches if branch.counts_visits),
+            detecting=tuple(branch.mapper for branch in branches if branch.detects),
+            has_errors=evaluator.scores_maps and any(branch.detects for branch in branches),
         )
         first = int(scans.stamps[0])
         with self._timer.stage("viewer"):
@@ -233,74 +148,67 @@ class Pipeline:
             self.viewer.event(0, first, f"{len(scans)} of {scans.total} scans selected on {scans.topic.name}")
             self.viewer.event(0, first, f"poses: {poses.source} ({poses.origin})")
 
-    def _show_detections(self, posed: PosedScan, detections: DetectionResult | None) -> None:
-        """Show the primitives detected after a scan, where there was a detection."""
-        if detections is not None:
-            with self._timer.stage("viewer"):
-                self.viewer.show_detections(posed.position, posed.scan.stamp, detections)
-
-    def _show_scan(self, posed: PosedScan, seconds: float, evaluator: ReplayEvaluator) -> None:
-        """Show the true world, a scan, the time it took to map (s), and its pose error."""
+    def _show_scan(self, posed: PosedScan, evaluator: ReplayEvaluator) -> None:
+        """Show the true world, a scan, and its pose error."""
         with self._timer.stage("viewer"):
             world = evaluator.world(posed.scan.stamp)
             if world is not None:
                 self.viewer.show_truth(posed.position, posed.scan.stamp, world)
-            self.viewer.show_scan(posed, seconds)
+            self.viewer.show_scan(posed)
             error = evaluator.pose_error(posed.position)
             if error is not None:
                 self.viewer.show_pose_error(posed, *error)
 
-    def _show_map(self, posed: PosedScan, grid: OccupancyGrid | None, evaluator: ReplayEvaluator) -> None:
-        """Show a snapshot of the map, where there is one, and its scores."""
-        if grid is not None:
-            scores = evaluator.score(grid)
-            with self._timer.stage("viewer"):
-                self.viewer.show_map(posed.position, posed.scan.stamp, grid, scores)
-
-    def _result(
+    def _results(
         self,
         log: LogSource,
         posed_scans: PosedScans,
-        mapping: MappingStage,
-        detection: DetectionStage | NoDetection,
         evaluator: ReplayEvaluator,
-        outcome: Outcome,
-    ) -> ReplayResult:
-        """Collect what the stages found out."""
-        scans = posed_scans.scan_log
-        self._notes += [*posed_scans.notes(), *mapping.notes(outcome.grid)]
-        return ReplayResult(
-            path=self.path,
-            options=self.options,
-            duration=scans.duration,
-            scans=scans.total,
-            scans_used=mapping.usage.scans,
-            rays=mapping.usage.rays,
-            lost=tuple(log.lost),
-            notes=(*(f"lost: {lost}" for lost in log.lost), *self._notes),
-            messages_lost=log.messages_lost,
-            poses=posed_scans.poses,
-            stamps=scans.stamps,
-            pose_rmse=evaluator.pose_rmse(),
-            pose_nees=evaluator.pose_nees(),
-            grid=outcome.grid,
-            noise_std=mapping.mapper.noise_std,
-            scores=outcome.scores,
-            detections=outcome.detections,
-            detection_skipped=detection.skipped,
-            seconds=self._timer.seconds | {"total": self._timer.total()},
+        branches: Sequence[Branch],
+        outcomes: Sequence[Outcome],
+    ) -> tuple[ReplayResult, ...]:
+        """Collect what the stages found out: a result for each branch."""
+        scans, total = posed_scans.scan_log, self._timer.total()
+        lost = [f"lost: {lost}" for lost in log.lost]
+        notes = [*lost, *self._notes, *posed_scans.notes()]
+        in_branches = sum(sum(branch.seconds.values()) for branch in branches)
+        return tuple(
+            ReplayResult(
+                path=self.path,
+                options=branch.options,
+                duration=scans.duration,
+                scans=scans.total,
+                scans_used=branch.usage.scans,
+                rays=branch.usage.rays,
+                lost=tuple(log.lost),
+                notes=(*notes, *branch.notes(outcome.grid)),
+                messages_lost=log.messages_lost,
+                poses=posed_scans.poses,
+                stamps=scans.stamps,
+                pose_rmse=evaluator.pose_rmse(),
+                pose_nees=evaluator.pose_nees(),
+                grid=outcome.grid,
+                noise_std=branch.noise_std,
+                scores=outcome.scores,
+                detections=outcome.detections,
+                detection_skipped=branch.detection_skipped,
+                seconds=_added(self._timer.seconds, branch.seconds)
+                | {"total": total - in_branches + sum(branch.seconds.values())},
+            )
+            for branch, outcome in zip(branches, outcomes, strict=True)
         )
 
-    def _show_result(self, result: ReplayResult) -> None:
-        """Show the final map and detections, the notes and the summary, and close the viewer."""
-        position, stamp = len(result.stamps) - 1, int(result.stamps[-1])
+    def _show_results(self, results: Sequence[ReplayResult]) -> None:
+        """Show the final maps and detections, the notes and the summary, and close the viewer."""
+        position, stamp = len(results[0].stamps) - 1, int(results[0].stamps[-1])
         with self._timer.stage("viewer"):
-            if result.detections is not None:
-                self.viewer.show_detections(position, stamp, result.detections)
-            for note in result.notes:
+            for result in results:
+                if result.detections is not None:
+                    self.viewer.show_detections(result.options.mapper, position, stamp, result.detections)
+                self.viewer.show_map(result.options.mapper, position, stamp, result.grid, result.scores)
+            for note in distinct_notes(results):
                 self.viewer.event(position, stamp, note, warning=True)
-            self.viewer.show_map(position, stamp, result.grid, result.scores)
-            self.viewer.finish(result)
+            self.viewer.finish(results)
 
     @contextmanager
     def _abandoned_on_failure(self) -> Iterator[None]:
@@ -310,3 +218,8 @@ class Pipeline:
         except BaseException:
             self.viewer.abandon()
             raise
+
+
+def _added(a: Mapping[str, float], b: Mapping[str, float]) -> dict[str, float]:
+    """Add the seconds of stages by name."""
+    return {name: a[name] + b[name] for name in a}

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+import math
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -24,6 +25,21 @@ SCHEMA = "prim-replay/1"
 
 MIN_REFINED_NOISE = 0.002
 """The lower bound of the range noise (m) that refinement estimates, which the table shows beside the mapper's."""
+
+COMPARED = (
+    ("mapper", ""),
+    ("noise", "mm"),
+    ("map F1", "%"),
+    ("AUC", ""),
+    ("found", ""),
+    ("F1", "%"),
+    ("position", "mm"),
+    ("size", "mm"),
+    ("angle", "deg"),
+    ("mapping", "s"),
+)
+"""What is compared of several mappers, and its unit: range noise; F1 of occupied cells and AUC of the map; number, F1
+and mean errors of the primitives; the time of mapping."""
 
 MIN_NOISE_CELLS = 1.5
 """The mapper's range noise, which the table calls «range noise», cannot be distinguished from the size of the cells
@@ -165,6 +181,7 @@ def _visits(grid: OccupancyGrid) -> dict[str, Any] | None:
 def summary_rows(result: ReplayResult) -> list[tuple[str, str]]:
     """Return the rows of the table that ends a replay: name, and value with its unit."""
     return [
+        *_log_rows(result),
         *_map_rows(result),
         *_pose_rows(result),
         *_score_rows(result.scores),
@@ -173,13 +190,61 @@ def summary_rows(result: ReplayResult) -> list[tuple[str, str]]:
     ]
 
 
+def shared_rows(results: Sequence[ReplayResult]) -> list[tuple[str, str]]:
+    """Return the rows that hold for all mappers of a replay: name, and value with its unit."""
+    rows = [*_log_rows(results[0]), *_pose_rows(results[0]), *_skipped_rows(results)]
+    return [*rows, ("time", f"{sum(result.seconds['total'] for result in results):.2f} s")]
+
+
+def comparison_table(results: Sequence[ReplayResult]) -> list[list[str]]:
+    """Compare the mappers of a replay.
+
+    Args:
+        results: A result for each mapper.
+
+    Returns:
+        Names of columns, their units, and a row for each mapper, all of the same length; columns without any value
+        are left out.
+    """
+    cells = zip(*map(_comparison_row, results), strict=True)
+    columns = [(*head, *values) for head, values in zip(COMPARED, cells, strict=True) if any(values)]
+    return [list(row) for row in zip(*columns, strict=True)]
+
+
+def _comparison_row(result: ReplayResult) -> list[str]:
+    """Return what is compared of a mapper's result, in the order of COMPARED; empty for what it does not have."""
+    scores, detections = result.scores, result.detections
+    errors = detections.errors if detections else None
+    size = mean_size_error(errors) if errors else None
+    return [
+        result.options.mapper,
+        _scaled(result.noise_std, 1000),
+        _scaled(scores.occupied_f1 if scores else None, 100),
+        _scaled(scores.auc if scores else None, 1, 4),
+        str(len(detections.detections.found)) if detections else "",
+        _scaled(errors.f1 if errors else None, 100),
+        _scaled(errors.position if errors else None, 1000, 2),
+        _scaled(size, 1000, 2),
+        _scaled(errors.angle if errors else None, math.degrees(1), 2),
+        f"{result.seconds['map']:.2f}",
+    ]
+
+
+def _scaled(value: float | None, factor: float, digits: int = 1) -> str:
+    return "" if value is None else f"{factor * value:.{digits}f}"
+
+
+def _log_rows(result: ReplayResult) -> Iterator[tuple[str, str]]:
+    """Yield what was replayed."""
+    used = f"{result.scans_used} of {result.scans}" if result.scans_used != result.scans else f"{result.scans}"
+    yield "log", f"{result.path.name}, {result.duration:.1f} s, {used} scans, {result.rays:,} rays"
+    yield "poses", f"{result.poses.source} ({result.poses.origin}){', matched scans' * result.poses.matched}"
+
+
 def _map_rows(result: ReplayResult) -> Iterator[tuple[str, str]]:
     """Yield what was mapped, and how."""
     frame = result.grid.frame
     x0, y0, x1, y1 = frame.bounds
-    used = f"{result.scans_used} of {result.scans}" if result.scans_used != result.scans else f"{result.scans}"
-    yield "log", f"{result.path.name}, {result.duration:.1f} s, {used} scans, {result.rays:,} rays"
-    yield "poses", f"{result.poses.source} ({result.poses.origin}){', matched scans' * result.poses.matched}"
     yield "map", f"{result.options.mapper}, {frame.cols} x {frame.rows} cells of {frame.resolution:g} m"
     yield "bounds", f"x {x0:.2f} to {x1:.2f} m, y {y0:.2f} to {y1:.2f} m"
     if result.noise_std is not None:
@@ -221,8 +286,14 @@ def _detection_rows(result: ReplayResult) -> Iterator[tuple[str, str]]:
             yield "range noise", f"{bound}{noise_std * 1000:.1f} mm (estimated by refinement)"
         if result.detections.errors is not None:
             yield from _error_rows(result.detections.errors)
-    if result.detection_skipped is not None:
-        yield "primitives", f"detection skipped: {result.detection_skipped}"
+    yield from _skipped_rows([result])
+
+
+def _skipped_rows(results: Sequence[ReplayResult]) -> Iterator[tuple[str, str]]:
+    """Yield why detection was skipped, where it was."""
+    for reason in dict.fromkeys(result.detection_skipped for result in results):
+        if reason is not None:
+            yield "primitives", f"detection skipped: {reason}"
 
 
 def _time_row(result: ReplayResult) -> tuple[str, str]:
@@ -257,10 +328,17 @@ def _error_rows(errors: DetectionErrors) -> Iterator[tuple[str, str]]:
     """Yield precision and recall of the detections, and their mean errors."""
     found = f"precision {errors.precision:.1%}, recall {errors.recall:.1%}, F1 {errors.f1:.1%}"
     yield "detection", f"{found} (kind, IoU 0.5)"
-    if errors.position is not None and errors.width is not None and errors.height is not None:
-        size = 500 * (errors.width + errors.height)
+    size = mean_size_error(errors)
+    if errors.position is not None and size is not None:
         turn = "" if errors.angle is None else f", angle {np.degrees(errors.angle):.1f} deg"
-        yield "errors", f"position {1000 * errors.position:.1f} mm, size {size:.1f} mm{turn} (means)"
+        yield "errors", f"position {1000 * errors.position:.1f} mm, size {1000 * size:.1f} mm{turn} (means)"
+
+
+def mean_size_error(errors: DetectionErrors) -> float | None:
+    """Return the mean error (m) of width and height; None where nothing was found."""
+    if errors.width is None or errors.height is None:
+        return None
+    return (errors.width + errors.height) / 2
 
 
 def _range_noise(std: float, given: bool, resolution: float) -> str:

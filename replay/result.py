@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -17,11 +18,11 @@ from replay.poses.laser_poses import LaserPoses
 
 @dataclass(frozen=True)
 class ReplayResult:
-    """All that a replay found out.
+    """All that a replay found out by one mapper.
 
     Attributes:
         path: The log's path.
-        options: The options of the replay.
+        options: The options of the replay, with this mapper alone.
         duration: The time from the earliest selected scan to the latest (s).
         scans: The number of scans on the topic.
         scans_used: The number of scans that were mapped.
@@ -38,7 +39,7 @@ class ReplayResult:
         scores: Scores of the map; None without ground truth.
         detections: The primitives in the map; None where detection was skipped.
         detection_skipped: Why detection was not possible, where it was wanted; None otherwise.
-        seconds: Wall time of each stage, and ``total``, by name (s).
+        seconds: Wall time of each stage, and ``total``, by name (s); without the time of other mappers.
     """
 
     path: Path
@@ -60,3 +61,8 @@ class ReplayResult:
     detections: DetectionResult | None
     detection_skipped: str | None
     seconds: dict[str, float]
+
+
+def distinct_notes(results: Sequence[ReplayResult]) -> list[str]:
+    """Return the notes of results of one log, each once."""
+    return list(dict.fromkeys(note for result in results for note in result.notes))

@@ -19,16 +19,20 @@ Item = TypeVar("Item")
 class StageTimer:
     """Wall time spent in each stage (s).
 
-    Time in a stage that is nested in another stage counts towards the inner one only.
+    Time in a stage that is nested in another stage counts towards the inner one only, be it of another timer that
+    shares the clock.
+
+    Args:
+        shared: A timer whose clock this one shares; None for a clock of its own, which starts now.
 
     Attributes:
         seconds: The time of each stage so far, by name (s).
     """
 
-    def __init__(self) -> None:
+    def __init__(self, shared: StageTimer | None = None) -> None:
         self.seconds: dict[str, float] = dict.fromkeys(STAGES, 0.0)
-        self._start = time.perf_counter()
-        self._nested: list[float] = []
+        self._start: float = shared._start if shared else time.perf_counter()
+        self._nested: list[float] = shared._nested if shared else []
 
     @contextmanager
     def stage(self, name: str) -> Iterator[None]:
@@ -63,7 +67,7 @@ class StageTimer:
             yield item  # type: ignore[misc]
 
     def total(self) -> float:
-        """Return the seconds since the timer was made."""
+        """Return the seconds since the clock started."""
         return time.perf_counter() - self._start
 
 

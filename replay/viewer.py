@@ -1,4 +1,4 @@
-"""All that talks to rerun: the recording, its layout, and what is drawn on it."""
+"""All that is sent to rerun: the recording, and what is drawn on it."""
 
 from __future__ import annotations
 
@@ -9,7 +9,6 @@ from urllib.parse import quote
 
 import numpy as np
 import rerun as rr
-import rerun.blueprint as rrb
 from numpy.typing import NDArray
 
 from mapping.grid import OccupancyGrid
@@ -21,6 +20,21 @@ from prim.scan import PosedScan
 from prim.world import World
 from replay.detection_stage import DetectionResult
 from replay.result import ReplayResult
+from replay.viewer_layout import (
+    ANGLE_ERROR,
+    DETECTION_SCORES,
+    HEADING_ERROR,
+    LENGTH_ERRORS,
+    MAPPING_TIME,
+    POSITION_ERROR,
+    SCAN,
+    SCENE,
+    SCORES,
+    STAMP,
+    Color,
+    blueprint,
+    layers,
+)
 from replay.viewing.checks import check_display, check_viewer, create_partial, find_free_port, partial_path
 from replay.viewing.drawing import (
     confidence_ellipse,
@@ -39,8 +53,6 @@ if TYPE_CHECKING:
     from detect.detection import Detection
 
 APPLICATION = "prim"
-STAMP, SCAN = "stamp", "scan"
-"""The two timelines: the log's own time, and the number of the scan."""
 
 TRAJECTORY_POINTS = 2000
 """The trajectory is drawn with about this many points at most."""
@@ -54,13 +66,8 @@ GRPC_PORT, WEB_PORT = 9876, 9090
 FLUSH_SECONDS = 60.0
 """How long the rest of a recording may take to be written or sent (s)."""
 
-FIELD_OF_VIEW = math.radians(55)
-"""The viewer's vertical field of view (rad)."""
-
 LASER_LENGTH, MAX_SCALE = 0.06, 10.0
 """The laser's arrow is as long as this share of the map's size, and of this size (m) at most."""
-
-Color = tuple[int, int, int]
 
 SCAN_COLOR = (255, 80, 60)
 TRAJECTORY_COLOR = (40, 110, 220)
@@ -70,38 +77,6 @@ LABEL_COLOR = (255, 255, 255)
 
 BOUNDS_ALPHA = 130
 """Opacity (0 to 255) of the outlines at one standard deviation."""
-
-SCORES = {
-    "occupied_f1": ("occupied F1", (255, 255, 255)),
-    "occupied_precision": ("occupied precision", (86, 180, 233)),
-    "occupied_recall": ("occupied recall", (230, 159, 0)),
-    "free_accuracy": ("free accuracy", (0, 158, 115)),
-    "auc": ("AUC", (204, 121, 167)),
-}
-"""The map's scores over time: label and colour of each line."""
-
-DETECTION_SCORES = {
-    "f1": ("F1", (255, 255, 255)),
-    "precision": ("precision", (86, 180, 233)),
-    "recall": ("recall", (230, 159, 0)),
-    "iou": ("mean IoU", (0, 158, 115)),
-}
-"""Scores of the detections over time."""
-
-LENGTH_ERRORS = {
-    "position": ("position, mm", (86, 180, 233)),
-    "width": ("width, mm", (230, 159, 0)),
-    "height": ("height, mm", (0, 158, 115)),
-}
-"""Mean errors of the detections over time; that of the angle has a plot of its own."""
-
-ANGLE_ERROR = ("angle, degrees", (204, 121, 167))
-
-POSITION_ERROR = (("position, mm", (86, 180, 233)), ("expected (1σ), mm", (40, 90, 130)))
-HEADING_ERROR = (("heading, degrees", (230, 159, 0)), ("expected (1σ), degrees", (130, 90, 0)))
-"""Errors of the poses over time, each with its expected standard deviation, where there is one."""
-
-MAPPING_TIME = ("mapping, ms a scan", (86, 180, 233))
 
 
 class RecordingError(PrimError):
@@ -133,6 +108,8 @@ class RerunViewer:
         self._recording.set_log_time_enabled(False)
         self._batch = ScanBatch(options.live, options.watched)
         self._pose_errors: list[tuple[tuple[int, int], tuple[float, float], tuple[float, float]]] = []
+        self._mapping_times: dict[str, list[tuple[int, int, float]]] = {}
+        self._layers: dict[str, str] = {}
         self._trajectory: list[tuple[float, float]] = []
         self._world: World | None = None
         self._size = 1.0
@@ -143,18 +120,21 @@ class RerunViewer:
         self._open_sinks()
         x0, y0, x1, y1 = scene.bounds
         self._size = max(x1 - x0, y1 - y0)
-        self._recording.send_recording_name(f"{scene.log} ({scene.mapper})")
-        self._recording.send_blueprint(_blueprint(scene))
-        self._log_static("map", rr.ViewCoordinates.RIGHT_HAND_Z_UP)
-        self._log_static("evidence", rr.ViewCoordinates.RIGHT_HAND_Z_UP)
-        self._name_series("scores", SCORES.values())
+        self._layers = layers(scene.mappers)
+        self._recording.send_recording_name(f"{scene.log} ({', '.join(scene.mappers)})")
+        self._recording.send_blueprint(blueprint(scene))
         self._name_series("pose_error/position", POSITION_ERROR)
         self._name_series("pose_error/heading", HEADING_ERROR)
-        if scene.has_errors:
-            self._name_series("errors/found", DETECTION_SCORES.values())
-            self._name_series("errors/lengths", LENGTH_ERRORS.values())
-            self._name_series("errors/angle", [ANGLE_ERROR])
-        self._name_series("timing", [MAPPING_TIME])
+        self._log_static(SCENE, rr.ViewCoordinates.RIGHT_HAND_Z_UP)
+        for layer in self._layers.values():
+            self._log_static(f"{layer}map", rr.ViewCoordinates.RIGHT_HAND_Z_UP)
+            self._log_static(f"{layer}evidence", rr.ViewCoordinates.RIGHT_HAND_Z_UP)
+            self._name_series(f"{layer}scores", SCORES.values())
+            if scene.has_errors:
+                self._name_series(f"{layer}errors/found", DETECTION_SCORES.values())
+                self._name_series(f"{layer}errors/lengths", LENGTH_ERRORS.values())
+                self._name_series(f"{layer}errors/angle", [ANGLE_ERROR])
+            self._name_series(f"{layer}timing", [MAPPING_TIME])
 
     def show_truth(self, position: int, stamp: int, world: World) -> None:
         """See :meth:`.Viewer.show_truth`."""
@@ -166,7 +146,7 @@ class RerunViewer:
         radius = rr.Radius.ui_points(1.0)
         if world.primitives:
             self._recording.log(
-                "map/truth/primitives",
+                f"{SCENE}/truth/primitives",
                 rr.LineStrips3D(
                     [self._raised(ring(primitive), TRUTH_HEIGHT) for primitive in world.primitives],
                     labels=[str(primitive.kind) for primitive in world.primitives],
@@ -177,25 +157,29 @@ class RerunViewer:
             )
         if world.walls:
             strips = list(self._raised(np.asarray(world.walls).reshape(-1, 2, 2), TRUTH_HEIGHT))
-            self._recording.log("map/truth/walls", rr.LineStrips3D(strips, colors=[TRUTH_COLOR], radii=radius))
+            self._recording.log(f"{SCENE}/truth/walls", rr.LineStrips3D(strips, colors=[TRUTH_COLOR], radii=radius))
 
-    def show_scan(self, posed: PosedScan, seconds: float) -> None:
+    def show_scan(self, posed: PosedScan) -> None:
         """See :meth:`.Viewer.show_scan`."""
         self._trajectory.append((posed.pose.x, posed.pose.y))
-        entry = ScanEntry(posed.position, posed.scan.stamp, posed.pose, posed.points, seconds)
-        if self._batch.add(entry):
+        if self._batch.add(ScanEntry(posed.position, posed.scan.stamp, posed.pose, posed.points)):
             self._send_batch()
 
-    def show_map(self, position: int, stamp: int, grid: OccupancyGrid, scores: MapScores | None) -> None:
+    def show_mapping_time(self, mapper: str, posed: PosedScan, seconds: float) -> None:
+        """See :meth:`.Viewer.show_mapping_time`."""
+        self._mapping_times.setdefault(mapper, []).append((posed.position, posed.scan.stamp, 1e3 * seconds))
+
+    def show_map(self, mapper: str, position: int, stamp: int, grid: OccupancyGrid, scores: MapScores | None) -> None:
         """See :meth:`.Viewer.show_map`."""
         self._send_batch()
         self._set_time(position, stamp)
-        self._recording.log("map/grid", _occupancy_map(grid))
+        layer = self._layers[mapper]
+        self._recording.log(f"{layer}map/grid", _occupancy_map(grid))
         if grid.visits is not None:
-            self._recording.log("evidence/grid", _visits_map(grid))
+            self._recording.log(f"{layer}evidence/grid", _visits_map(grid))
         if scores is not None:
             values = [value if (value := getattr(scores, name)) is not None else math.nan for name in SCORES]
-            self._recording.log("scores", rr.Scalars(values))
+            self._recording.log(f"{layer}scores", rr.Scalars(values))
 
     def show_pose_error(self, posed: PosedScan, position_error: float, heading_error: float) -> None:
         """See :meth:`.Viewer.show_pose_error`."""
@@ -204,22 +188,23 @@ class RerunViewer:
         angles = math.degrees(heading_error), math.degrees(heading_std)
         self._pose_errors.append(((posed.position, posed.scan.stamp), lengths, angles))
 
-    def show_detections(self, position: int, stamp: int, result: DetectionResult) -> None:
+    def show_detections(self, mapper: str, position: int, stamp: int, result: DetectionResult) -> None:
         """See :meth:`.Viewer.show_detections`."""
         self._send_batch()
         self._set_time(position, stamp)
-        found = result.detections.found
-        self._recording.log("map/detections", self._outlines(found))
-        self._recording.log("map/uncertainty", self._uncertainty_bounds(found))
-        self._recording.log("map/labels", self._labels(result))
-        self._recording.log("detections", rr.TextDocument(detections_markdown(result), media_type="text/markdown"))
-        self._recording.log("crops", rr.Image(crop_sheet(found)))
+        found, layer = result.detections.found, self._layers[mapper]
+        table = rr.TextDocument(detections_markdown(result), media_type=rr.MediaType.MARKDOWN)
+        self._recording.log(f"{layer}map/detections", self._outlines(found))
+        self._recording.log(f"{layer}map/uncertainty", self._uncertainty_bounds(found))
+        self._recording.log(f"{layer}map/labels", self._labels(result))
+        self._recording.log(f"{layer}detections", table)
+        self._recording.log(f"{layer}crops", rr.Image(crop_sheet(found)))
         errors = result.errors
         if errors is not None:
-            self._recording.log("errors/found", rr.Scalars(_values(errors, DETECTION_SCORES, 1.0)))
-            self._recording.log("errors/lengths", rr.Scalars(_values(errors, LENGTH_ERRORS, 1000.0)))
+            self._recording.log(f"{layer}errors/found", rr.Scalars(_values(errors, DETECTION_SCORES, 1.0)))
+            self._recording.log(f"{layer}errors/lengths", rr.Scalars(_values(errors, LENGTH_ERRORS, 1000.0)))
             angle = math.nan if errors.angle is None else math.degrees(errors.angle)
-            self._recording.log("errors/angle", rr.Scalars([angle]))
+            self._recording.log(f"{layer}errors/angle", rr.Scalars([angle]))
 
     def event(self, position: int, stamp: int, text: str, warning: bool = False) -> None:
         """See :meth:`.Viewer.event`."""
@@ -227,10 +212,10 @@ class RerunViewer:
         level = rr.TextLogLevel.WARN if warning else rr.TextLogLevel.INFO
         self._recording.log("events", rr.TextLog(text, level=level))
 
-    def finish(self, result: ReplayResult) -> None:
+    def finish(self, results: Sequence[ReplayResult]) -> None:
         """See :meth:`.Viewer.finish`. Raises RecordingError where the recording cannot be written in full."""
         self._send_batch()
-        self._log_static("summary", rr.TextDocument(summary_markdown(result), media_type=rr.MediaType.MARKDOWN))
+        self._log_static("summary", rr.TextDocument(summary_markdown(results), media_type=rr.MediaType.MARKDOWN))
         try:
             self._recording.flush(timeout_sec=FLUSH_SECONDS)
         except Exception as error:  # rerun raises plain RuntimeErrors
@@ -333,15 +318,13 @@ class RerunViewer:
     # Scans, which are sent in batches
 
     def _send_batch(self) -> None:
-        """Send the gathered scans and pose errors as columns: one call for all instead of one for each."""
+        """Send the gathered scans, pose errors and times as columns: one call for all instead of one for each."""
         entries = self._batch.take()
         if entries:
             index = _time_columns([(entry.position, entry.stamp) for entry in entries])
             self._send_scans(index, entries)
             self._send_lasers(index, entries)
             self._send_ellipses(entries)
-            milliseconds = [entry.seconds * 1e3 for entry in entries]
-            self._send_columns("timing", index, rr.Scalars.columns(scalars=milliseconds))
             self._send_trajectory(entries[-1])
         errors, self._pose_errors = self._pose_errors, []
         if errors:
@@ -349,20 +332,27 @@ class RerunViewer:
             index = _time_columns(times)
             self._send_columns("pose_error/position", index, rr.Scalars.columns(scalars=lengths))
             self._send_columns("pose_error/heading", index, rr.Scalars.columns(scalars=angles))
+        times_of, self._mapping_times = self._mapping_times, {}
+        for mapper, mapped in times_of.items():
+            positions, stamps, milliseconds = zip(*mapped, strict=True)
+            index = _time_columns(list(zip(positions, stamps, strict=True)))
+            self._send_columns(f"{self._layers[mapper]}timing", index, rr.Scalars.columns(scalars=milliseconds))
 
     def _send_scans(self, index: Sequence[Any], entries: list[ScanEntry]) -> None:
         """Send the end points of scans."""
         counts = [len(entry.points) for entry in entries]
         points = self._raised(np.concatenate([entry.points for entry in entries]), SCAN_HEIGHT)
-        self._send_columns("map/scan", index, rr.Points3D.columns(positions=points).partition(counts))
-        self._set_style("map/scan", rr.Points3D.from_fields(colors=[SCAN_COLOR], radii=rr.Radius.ui_points(1.75)))
+        self._send_columns(f"{SCENE}/scan", index, rr.Points3D.columns(positions=points).partition(counts))
+        self._set_style(
+            f"{SCENE}/scan", rr.Points3D.from_fields(colors=[SCAN_COLOR], radii=rr.Radius.ui_points(1.75))
+        )
 
     def _send_trajectory(self, last: ScanEntry) -> None:
         """Send the trajectory so far, as dots: a robot that is warped has no line to show."""
         points = self._raised(np.asarray(subsample(self._trajectory, TRAJECTORY_POINTS)), TRAJECTORY_HEIGHT)
         self._set_time(last.position, last.stamp)
         dots = rr.Points3D(points, colors=[TRAJECTORY_COLOR], radii=rr.Radius.ui_points(1.75))
-        self._recording.log("map/trajectory", dots)
+        self._recording.log(f"{SCENE}/trajectory", dots)
 
     def _send_lasers(self, index: Sequence[Any], entries: list[ScanEntry]) -> None:
         """Send the laser's poses as arrows."""
@@ -370,8 +360,10 @@ class RerunViewer:
         length = LASER_LENGTH * min(self._size, MAX_SCALE)
         origins = self._raised(np.array([(pose.x, pose.y) for pose in poses]), TRUTH_HEIGHT)
         vectors = [(length * math.cos(pose.theta), length * math.sin(pose.theta), 0.0) for pose in poses]
-        self._send_columns("map/laser", index, rr.Arrows3D.columns(vectors=vectors, origins=origins))
-        self._set_style("map/laser", rr.Arrows3D.from_fields(colors=[LASER_COLOR], radii=rr.Radius.ui_points(2.5)))
+        self._send_columns(f"{SCENE}/laser", index, rr.Arrows3D.columns(vectors=vectors, origins=origins))
+        self._set_style(
+            f"{SCENE}/laser", rr.Arrows3D.from_fields(colors=[LASER_COLOR], radii=rr.Radius.ui_points(2.5))
+        )
 
     def _send_ellipses(self, entries: list[ScanEntry]) -> None:
         """Send the laser's 95 % confidence ellipses, where its poses have covariances."""
@@ -380,82 +372,12 @@ class RerunViewer:
             rings = [self._raised(confidence_ellipse(entry.pose), TRUTH_HEIGHT) for entry in uncertain]
             index = _time_columns([(entry.position, entry.stamp) for entry in uncertain])
             columns = rr.LineStrips3D.columns(strips=rings).partition([1] * len(rings))
-            self._send_columns("map/laser_95_percent", index, columns)
+            self._send_columns(f"{SCENE}/laser_95_percent", index, columns)
             style = rr.LineStrips3D.from_fields(colors=[LASER_COLOR], radii=rr.Radius.ui_points(1.0))
-            self._set_style("map/laser_95_percent", style)
+            self._set_style(f"{SCENE}/laser_95_percent", style)
 
     def _send_columns(self, path: str, index: Sequence[Any], columns: Any) -> None:
         self._recording.send_columns(path, indexes=index, columns=columns)
-
-
-def _blueprint(scene: Scene) -> rrb.Blueprint:
-    """Lay out the views, which is saved with the recording: maps at the left, tables and plots at the right."""
-    right = [_result_view(scene), *_plots(scene), rrb.TextLogView(origin="events", name="Events")]
-    shares = [2.0, *[2.0] * (len(right) - 2), 1.2]
-    return rrb.Blueprint(
-        rrb.Horizontal(_map_view(scene), rrb.Vertical(*right, row_shares=shares), column_shares=[3, 2]),
-        rrb.TimePanel(timeline=STAMP, state="collapsed"),
-        rrb.BlueprintPanel(state="collapsed"),
-        rrb.SelectionPanel(state="collapsed"),
-    )
-
-
-def _map_view(scene: Scene) -> Any:
-    """Lay out the map from above; beside it the visits, where the mapper has it."""
-    x0, y0, x1, y1 = scene.bounds
-    centre_x, centre_y = (x0 + x1) / 2, (y0 + y1) / 2
-    height = 1.1 * max(y1 - y0, x1 - x0) / 2 / math.tan(FIELD_OF_VIEW / 2)
-    top_down = rrb.EyeControls3D(
-        kind=rrb.Eye3DKind.Orbital,
-        position=(centre_x, centre_y - 1e-3 * height, height),
-        look_target=(centre_x, centre_y, 0.0),
-        eye_up=(0.0, 1.0, 0.0),
-    )
-
-    def from_above(origin: str, name: str) -> rrb.Spatial3DView:
-        return rrb.Spatial3DView(
-            origin=origin,
-            name=name,
-            eye_controls=top_down,
-            line_grid=rrb.LineGrid3D(visible=False),
-            background=(235, 235, 235, 255),
-        )
-
-    view = from_above("map", f"Map ({scene.mapper}), from above")
-    if not scene.has_visits:
-        return view
-    return rrb.Tabs(view, from_above("evidence", "Visits: rays per cell"), active_tab=0)
-
-
-def _result_view(scene: Scene) -> Any:
-    """Lay out the summary; beside it the table and the crops of detections, where there are any."""
-    summary = rrb.TextDocumentView(origin="summary", name="Result")
-    if not scene.has_detections:
-        return summary
-    table = rrb.TextDocumentView(origin="detections", name="Detections")
-    crops = rrb.Spatial2DView(origin="crops", name="Crops, as the networks see them")
-    return rrb.Tabs(summary, table, crops, active_tab=0)
-
-
-def _plots(scene: Scene) -> list[Any]:
-    """Lay out the time series: errors of detections, accuracy of the map, errors of poses, timings."""
-    plots: list[Any] = []
-    unit = rrb.ScalarAxis(range=(0.0, 1.02), zoom_lock=True)
-    if scene.has_errors:
-        found = _plot("errors/found", "Primitives found", axis_y=unit)
-        lengths, angle = _plot("errors/lengths", "Errors: lengths"), _plot("errors/angle", "Errors: angle")
-        plots.append(rrb.Tabs(found, lengths, angle, active_tab=0))
-    if scene.has_scores:
-        plots.append(_plot("scores", "Map accuracy", axis_y=unit))
-    if scene.has_pose_errors:
-        position, heading = _plot("pose_error/position", "Pose error"), _plot("pose_error/heading", "Heading error")
-        plots.append(rrb.Tabs(position, heading, active_tab=0))
-    return [*plots, _plot("timing", "Stage timings")]
-
-
-def _plot(origin: str, name: str, **properties: Any) -> rrb.TimeSeriesView:
-    legend = rrb.PlotLegend(rrb.Corner2D.RightBottom)
-    return rrb.TimeSeriesView(origin=origin, name=name, plot_legend=legend, **properties)
 
 
 def _values(errors: DetectionErrors, series: Mapping[str, object], unit: float) -> list[float]:

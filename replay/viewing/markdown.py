@@ -3,17 +3,24 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 from replay.detection_stage import DetectionResult
-from replay.report import summary_rows
+from replay.report import comparison_table, shared_rows, summary_rows
 from replay.result import ReplayResult
 
 
-def summary_markdown(result: ReplayResult) -> str:
-    """Return the table that ends a replay."""
-    rows = "\n".join(f"| **{name}** | {value} |" for name, value in summary_rows(result))
-    return f"| | |\n|---|---|\n{rows}\n"
+def summary_markdown(results: Sequence[ReplayResult]) -> str:
+    """Return the table that ends a replay; of several mappers, what they share and how they compare."""
+    shared = summary_rows(results[0]) if len(results) == 1 else shared_rows(results)
+    rows = "\n".join(f"| **{name}** | {value} |" for name, value in shared)
+    text = f"| | |\n|---|---|\n{rows}\n"
+    if len(results) == 1:
+        return text
+    names, units, *rows_of_mappers = comparison_table(results)
+    header = [f"{name}, {unit}" if unit else name for name, unit in zip(names, units, strict=True)]
+    lines = [header, ["---"] * len(header), *rows_of_mappers]
+    return text + "\n" + "".join(f"| {' | '.join(line)} |\n" for line in lines)
 
 
 def detections_markdown(result: DetectionResult) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Protocol
@@ -56,22 +57,22 @@ class Scene:
 
     Attributes:
         log: The log's name.
-        mapper: The mapper.
+        mappers: The mappers.
         bounds: The map's bounds (m): x0, y0, x1, y1.
-        has_scores: Whether the map is scored against ground truth.
+        has_scores: Whether maps are scored against ground truth.
         has_pose_errors: Whether the poses are compared with the true ones.
-        has_visits: Whether the mapper counts the rays of each cell.
-        has_detections: Whether primitives are detected.
-        has_errors: Whether the detections are evaluated against ground truth.
+        counting: The mappers that count the rays of each cell.
+        detecting: The mappers in whose maps primitives are detected.
+        has_errors: Whether detections are evaluated against ground truth.
     """
 
     log: str
-    mapper: str
+    mappers: tuple[str, ...]
     bounds: Bounds
     has_scores: bool
     has_pose_errors: bool
-    has_visits: bool = False
-    has_detections: bool = False
+    counting: tuple[str, ...] = ()
+    detecting: tuple[str, ...] = ()
     has_errors: bool = False
 
 
@@ -96,18 +97,27 @@ class Viewer(Protocol):
             world: The world at that time.
         """
 
-    def show_scan(self, posed: PosedScan, seconds: float) -> None:
+    def show_scan(self, posed: PosedScan) -> None:
         """Show a scan and the laser's pose.
 
         Args:
             posed: The scan with its pose.
-            seconds: The time that it took to map (s).
         """
 
-    def show_map(self, position: int, stamp: int, grid: OccupancyGrid, scores: MapScores | None) -> None:
-        """Show the map so far.
+    def show_mapping_time(self, mapper: str, posed: PosedScan, seconds: float) -> None:
+        """Show the time that it took to map a scan.
 
         Args:
+            mapper: The mapper.
+            posed: The scan.
+            seconds: The time (s).
+        """
+
+    def show_map(self, mapper: str, position: int, stamp: int, grid: OccupancyGrid, scores: MapScores | None) -> None:
+        """Show a mapper's map so far.
+
+        Args:
+            mapper: The mapper.
             position: The latest scan's position in the selection.
             stamp: Its stamp (ns).
             grid: The map.
@@ -123,10 +133,11 @@ class Viewer(Protocol):
             heading_error: Difference of the headings (rad).
         """
 
-    def show_detections(self, position: int, stamp: int, result: DetectionResult) -> None:
-        """Show the primitives in the map so far.
+    def show_detections(self, mapper: str, position: int, stamp: int, result: DetectionResult) -> None:
+        """Show the primitives in a mapper's map so far.
 
         Args:
+            mapper: The mapper.
             position: The latest scan's position in the selection.
             stamp: Its stamp (ns).
             result: The detections.
@@ -142,8 +153,8 @@ class Viewer(Protocol):
             warning: Whether it is a warning.
         """
 
-    def finish(self, result: ReplayResult) -> None:
-        """Show the result, and close; nothing is shown after it."""
+    def finish(self, results: Sequence[ReplayResult]) -> None:
+        """Show the results, one for each mapper, and close; nothing is shown after it."""
 
     def abandon(self) -> None:
         """Discard what was shown: the replay failed."""
@@ -160,22 +171,25 @@ class NullViewer:
     def show_truth(self, position: int, stamp: int, world: World) -> None:
         """See :meth:`Viewer.show_truth`."""
 
-    def show_scan(self, posed: PosedScan, seconds: float) -> None:
+    def show_scan(self, posed: PosedScan) -> None:
         """See :meth:`Viewer.show_scan`."""
 
-    def show_map(self, position: int, stamp: int, grid: OccupancyGrid, scores: MapScores | None) -> None:
+    def show_mapping_time(self, mapper: str, posed: PosedScan, seconds: float) -> None:
+        """See :meth:`Viewer.show_mapping_time`."""
+
+    def show_map(self, mapper: str, position: int, stamp: int, grid: OccupancyGrid, scores: MapScores | None) -> None:
         """See :meth:`Viewer.show_map`."""
 
     def show_pose_error(self, posed: PosedScan, position_error: float, heading_error: float) -> None:
         """See :meth:`Viewer.show_pose_error`."""
 
-    def show_detections(self, position: int, stamp: int, result: DetectionResult) -> None:
+    def show_detections(self, mapper: str, position: int, stamp: int, result: DetectionResult) -> None:
         """See :meth:`Viewer.show_detections`."""
 
     def event(self, position: int, stamp: int, text: str, warning: bool = False) -> None:
         """See :meth:`Viewer.event`."""
 
-    def finish(self, result: ReplayResult) -> None:
+    def finish(self, results: Sequence[ReplayResult]) -> None:
         """See :meth:`Viewer.finish`."""
 
     def abandon(self) -> None:

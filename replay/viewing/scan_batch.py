@@ -23,14 +23,12 @@ class ScanEntry(NamedTuple):
         stamp: Its stamp (ns).
         pose: The laser's pose.
         points: End points (M, 2) in the map frame (m).
-        seconds: The time that it took to map (s).
     """
 
     position: int
     stamp: int
     pose: Pose2D
     points: FloatArray
-    seconds: float
 
 
 class ScanBatch:

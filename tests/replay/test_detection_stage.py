@@ -19,7 +19,7 @@ from prim.errors import UsageError
 from prim.shapes import Kind, Primitive
 from recorder.session import Session
 from replay import cli
-from replay.detection_stage import add_frame_uncertainty
+from replay.detection_refiner import add_frame_uncertainty
 from replay.options import ReplayOptions
 from replay.pipeline import Pipeline
 from replay.report import report_json, summary_rows
@@ -115,7 +115,7 @@ def test_intermediate_detections_are_on_the_timeline(
     result = replayed(noisy_session, viewer, mapper="prob", detect_every=10)
     rows = rows_of(tmp_path / "a.rrd")
     outlines = timed(rows["/map/detections"])
-    wanted = [*range(9, result.scans, 10)]
+    wanted = [0, *range(9, result.scans, 10)]
     assert sorted({row["scan"] for row in outlines}) == sorted({*wanted, result.scans - 1})
     labels = timed(rows["/map/labels"])
     assert (
@@ -176,7 +176,7 @@ def test_unusable_weights_are_refused_in_one_line(
 def test_the_table_names_missing_weights(noisy_session: Session, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("detect.networks.weights.SHIPPED", Path("nowhere"))
     result = Pipeline(noisy_session.path, ReplayOptions()).run()
-    assert "detection skipped: no weights for maps of det" in dict(summary_rows(result))["primitives"]
+    assert "detection skipped: no weights for maps of prob" in dict(summary_rows(result))["primitives"]
     assert not result.notes
     with pytest.raises(UsageError, match="give --weights"):
         Pipeline(noisy_session.path, ReplayOptions(detect_every=3)).run()

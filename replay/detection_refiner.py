@@ -1,0 +1,195 @@
+"""Refinement of the detections of a replay: by a subset of the scans so far on the way, by all scans at the end."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from mapping.grid import OccupancyGrid
+from prim.arrays import FloatArray
+from prim.scan import Scan
+from prim.se2 import Pose2D, frame_covariances
+from prim.shapes import Primitive
+from prim.threads import cores
+
+if TYPE_CHECKING:
+    from detect.detection import Detections
+    from detect.refinement.refine import Effort
+
+
+@dataclass(frozen=True)
+class IntermediateOptions:
+    """How much work goes into detection before the last scan; all set by hand.
+
+    Attributes:
+        scans: Primitives are refined with the rays of this many scans, to twice as many.
+        kind_search_growth: Kinds of primitives whose kind was certain are compared again once the number of scans has
+            grown by this factor since they were last.
+        proposals: At most this many connected components of the map that the networks missed are tried.
+        proposals_from: None are tried before this many scans: maps of few scans are full of fragments.
+    """
+
+    scans: int = 30
+    kind_search_growth: int = 4
+    proposals: int = 6
+    proposals_from: int = 40
+
+
+INTERMEDIATE = IntermediateOptions()
+
+
+class ScanSubset:
+    """A subset of the scans so far, evenly spread: ``size`` of them, to twice as many.
+
+    All are held at first. Whenever there are twice ``size``, every other one is dropped, and from then on half as
+    many are added.
+
+    Args:
+        size: The smallest number of scans that is held, once so many were added.
+
+    Attributes:
+        total: The number of scans that were added so far.
+    """
+
+    def __init__(self, size: int) -> None:
+        self.total = 0
+        self._size = size
+        self._stride = 1
+        self._selected = False
+        self._scans: list[list[tuple[Scan, Pose2D]]] = []
+
+    def add(self, scan: Scan, pose: Pose2D) -> None:
+        """Add a scan, or a piece of one: the later pieces of a scan are held where its first piece is.
+
+        Args:
+            scan: The scan or piece.
+            pose: The laser's pose.
+        """
+        if scan.first_beam:
+            if self._selected:
+                self._scans[-1].append((scan, pose))
+            return
+        self._selected = self.total % self._stride == 0
+        if self._selected:
+            self._scans.append([(scan, pose)])
+        self.total += 1
+        if len(self._scans) >= 2 * self._size:
+            self._scans = self._scans[::2]
+            self._stride *= 2
+
+    def pieces(self) -> list[tuple[Scan, Pose2D]]:
+        """Return the pieces of all scans that are held."""
+        return [piece for scan in self._scans for piece in scan]
+
+
+class DetectionRefiner:
+    """Fits detections to the rays of the scans, from a warm start where it was done before.
+
+    Args:
+        noise_std: The range noise (m); None to estimate it.
+        frame_covariance: The covariance (3, 3; m, rad) of the map frame's own pose, which adds to that of each
+            primitive; None where it is exact.
+        options: How much work goes into detection before the last scan.
+    """
+
+    def __init__(
+        self,
+        noise_std: float | None,
+        frame_covariance: FloatArray | None,
+        options: IntermediateOptions = INTERMEDIATE,
+    ) -> None:
+        self.scans = ScanSubset(options.scans)
+        self._options = options
+        self._noise_std = noise_std
+        self._frame_covariance = frame_covariance
+        self._previous: tuple[Detections, float | None] | None = None
+        self._kind_search_at = 0
+
+    def refine_so_far(self, detections: Detections, grid: OccupancyGrid) -> tuple[Detections, float | None]:
+        """Refine detections before the last scan, with the rays of a subset of the scans.
+
+        Primitives whose kind was certain the last time start from there, and keep their kind (warm start), unless
+        the number of scans has grown enough to search all kinds again.
+
+        Args:
+            detections: What the networks found.
+            grid: The map so far, which they found it in.
+
+        Returns:
+            The refined detections and the range noise (m), None where no ray passes any of them.
+        """
+        from detect.refinement.refine import Effort, WarmStart
+
+        search_kinds = self.scans.total >= self._options.kind_search_growth * self._kind_search_at
+        if search_kinds:
+            self._kind_search_at = self.scans.total
+        proposals = self._options.proposals if self.scans.total >= self._options.proposals_from else 0
+        warm_start = None if search_kinds or self._previous is None else WarmStart(*self._previous)
+        effort = Effort(warm_start, proposals, rounds=0)
+        self._previous = self._refine(detections, grid, self.scans.pieces(), effort)
+        return self._with_frame_uncertainty(self._previous[0]), self._previous[1]
+
+    def refine(
+        self, detections: Detections, grid: OccupancyGrid, scans: Iterable[tuple[Scan, Pose2D]]
+    ) -> tuple[Detections, float | None]:
+        """Refine detections with the rays of all scans.
+
+        Args:
+            detections: What the networks found.
+            grid: The map that they found it in.
+            scans: The pieces of all scans, with the laser's poses.
+
+        Returns:
+            The refined detections and the range noise (m), None where no ray passes any of them.
+        """
+        from detect.refinement.refine import THOROUGH
+
+        refined, noise_std = self._refine(detections, grid, scans, THOROUGH)
+        return self._with_frame_uncertainty(refined), noise_std
+
+    def _refine(
+        self, detections: Detections, grid: OccupancyGrid, scans: Iterable[tuple[Scan, Pose2D]], effort: Effort
+    ) -> tuple[Detections, float | None]:
+        # imported when it is needed: a replay without refinement starts faster
+        from detect.refinement.refine import refine_detections
+
+        return refine_detections(detections, scans, grid, self._noise_std, cores(), effort)
+
+    def _with_frame_uncertainty(self, detections: Detections) -> Detections:
+        """Add the uncertainty of the map frame's pose to that of the detections."""
+        if self._frame_covariance is None:
+            return detections
+        found = tuple(
+            detection
+            if detection.std is None
+            else replace(
+                detection, std=add_frame_uncertainty(detection.primitive, detection.std, self._frame_covariance)
+            )
+            for detection in detections.found
+        )
+        return replace(detections, found=found)
+
+
+def add_frame_uncertainty(
+    primitive: Primitive, std: Mapping[str, float], frame_covariance: FloatArray
+) -> dict[str, float]:
+    """Add the uncertainty of the map frame's own pose to a primitive's.
+
+    Both errors are taken as independent (see :func:`prim.se2.frame_covariances`).
+
+    Args:
+        primitive: The primitive.
+        std: Standard deviations of its parameters in the map frame, by name (m, rad).
+        frame_covariance: The covariance (3, 3; m, rad) of the frame's pose.
+
+    Returns:
+        The standard deviations with both added in quadrature, by name (m, rad).
+    """
+    position = np.array([[primitive.x, primitive.y, 0.0]])
+    variances = np.diag(frame_covariances(frame_covariance, position)[0]).tolist()
+    added = dict(zip(("x", "y", "theta"), variances, strict=True))
+    return {name: math.sqrt(value**2 + added.get(name, 0.0)) for name, value in std.items()}
