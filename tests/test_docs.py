@@ -1,13 +1,17 @@
-"""The documents: that what they name is there, and that the picture of the architecture is drawn from the code."""
+"""The documents: that what they name is there, that their pictures can be made anew, and what versions they name."""
 
 from __future__ import annotations
 
 import ast
+import os
 import re
+import subprocess
+import sys
 import tomllib
 from pathlib import Path
 
 import pytest
+import rerun as rr
 
 from docs.architecture import DETECTION, PICTURE, SCAN, picture
 from prim import __version__
@@ -42,6 +46,30 @@ def test_the_picture_names_what_the_files_define(file: str, name: str) -> None:
 
 def test_the_picture_is_drawn_anew_when_its_script_changes() -> None:
     assert PICTURE.read_text(encoding="utf-8") == picture(), "run python -m docs.architecture"
+
+
+def test_a_machine_that_cannot_render_is_told_so_in_one_line(tmp_path: Path) -> None:
+    recording, no_driver = tmp_path / "a.rrd", {"VK_DRIVER_FILES": "/nonexistent", "WGPU_BACKEND": "vulkan"}
+    with rr.RecordingStream("test") as stream:
+        stream.save(recording)
+        stream.set_time("scan", sequence=0)
+        stream.log("a", rr.Points2D([[0, 0]]))
+    command = [sys.executable, ROOT / "docs" / "screenshot.py", recording, tmp_path / "a.png"]
+    done = subprocess.run(
+        command, env=os.environ | no_driver, capture_output=True, text=True, check=False, timeout=60
+    )
+    assert done.returncode == 4
+    assert re.fullmatch("no picture: .*mesa-vulkan-drivers\n", done.stdout + done.stderr)
+
+
+def test_every_dependency_has_a_lowest_version() -> None:
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    wanted = [*project["dependencies"], *project["optional-dependencies"]["dev"]]
+    done = subprocess.run(
+        [sys.executable, ROOT / ".ci" / "lowest", "dev"], capture_output=True, text=True, check=True
+    )
+    assert len(done.stdout.split()) == len(wanted)
+    assert f"numpy=={re.search('numpy>=([0-9.]+)', ' '.join(wanted))[1]}" in done.stdout.split()
 
 
 def test_the_changelog_begins_with_the_version() -> None:
