@@ -1,12 +1,13 @@
-"""A screenshot of a recording in the rerun viewer, without a display: screenshot.py IN.rrd OUT.png [SHARE].
+"""A screenshot of a recording in the rerun viewer, without a display: screenshot.py IN.rrd OUT.png [SHARE] [--debug].
 
 SHARE is the time to show, as a share of the recording (1, the default, is its end). Exits with 4 where this machine
 cannot render (it needs a Vulkan driver, such as Debian's mesa-vulkan-drivers), and with 1 where a view reports that
-it cannot draw something.
+it cannot draw something. ``--debug`` shows what the viewer itself prints.
 """
 
 from __future__ import annotations
 
+import argparse
 import os
 import socket
 import subprocess
@@ -14,7 +15,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from pathlib import Path
 
 import numpy as np
@@ -53,6 +54,21 @@ def isolated_settings() -> Iterator[None]:
         yield
 
 
+@contextmanager
+def silent_children() -> Iterator[None]:
+    """Discard what processes print that are started meanwhile: a viewer that cannot render prints its stack."""
+    with Path(os.devnull).open("w") as nowhere:
+        kept = {stream: os.dup(stream) for stream in (1, 2)}
+        try:
+            for stream in kept:
+                os.dup2(nowhere.fileno(), stream)
+            yield
+        finally:
+            for stream, copy in kept.items():
+                os.dup2(copy, stream)
+                os.close(copy)
+
+
 def free_port() -> int:
     """Return a port that nothing listens on."""
     with socket.socket() as probe:
@@ -60,20 +76,25 @@ def free_port() -> int:
         return int(probe.getsockname()[1])
 
 
-def main(recording: Path, picture: Path, share: float) -> int:
+def main(recording: Path, picture: Path, share: float, debug: bool) -> int:
     """Open a recording in a headless viewer and save a screenshot.
 
     Args:
         recording: The recording.
         picture: The screenshot's file.
         share: The time to show, as a share of the recording.
+        debug: Show what the viewer prints.
 
     Returns:
         The exit code.
     """
     scan = round(last_scan(recording) * share)
     try:
-        with isolated_settings(), ViewerClient.spawn(headless=True, port=free_port()) as client:
+        with (
+            isolated_settings(),
+            nullcontext() if debug else silent_children(),
+            ViewerClient.spawn(headless=True, port=free_port()) as client,
+        ):
             client.open(str(recording.resolve()))
             time.sleep(2)
             client.set_time(TIMELINE, sequence=scan, play_state="paused")
@@ -81,7 +102,11 @@ def main(recording: Path, picture: Path, share: float) -> int:
             picture.write_bytes(client.take_screenshot())
             problems = reports(client)
     except Exception as error:
-        print(f"screenshot: cannot render here: {error}", file=sys.stderr)
+        print(
+            f"no picture: this machine cannot render ({error}); a Vulkan driver is needed: "
+            "apt-get install mesa-vulkan-drivers",
+            file=sys.stderr,
+        )
         return CANNOT_RENDER
     for problem in problems:
         print(f"screenshot: {problem}", file=sys.stderr)
@@ -89,4 +114,10 @@ def main(recording: Path, picture: Path, share: float) -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main(Path(sys.argv[1]), Path(sys.argv[2]), float(sys.argv[3]) if len(sys.argv) > 3 else 1.0))
+    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser.add_argument("recording", type=Path)
+    parser.add_argument("picture", type=Path)
+    parser.add_argument("share", type=float, nargs="?", default=1.0)
+    parser.add_argument("--debug", action="store_true")
+    given = parser.parse_args()
+    sys.exit(main(given.recording, given.picture, given.share, given.debug))
