@@ -6,8 +6,7 @@ Sessions that no network was trained on (seeds from 40000), 2 x 2 m, warped, 500
 networks'. No outlier is left out. mAP is that of the bounding boxes of refined outlines, each counted as every kind
 with that kind's posterior probability. Baselines: OpenCV's contours on the same maps (bench/classical.py); and fits
 of the true kind to the end points within 10 cm of each true outline: circles by RANSAC and least squares, rectangles
-as the box of minimum area around the points between the 2nd and 98th percentiles. OpenCV comes with the extra
-[train].
+as the box of minimum area around the points between the 2nd and 98th percentiles.
 """
 
 from __future__ import annotations

@@ -363,7 +363,7 @@ def write_image(path: Path, image: NDArray[np.uint8]) -> None:
         image: (rows, cols, 3).
     """
     part = path.with_suffix(f".{os.getpid()}.part")
-    part.write_bytes(cv2.imencode(".png", cv2.cvtColor(image, cv2.COLOR_RGB2BGR))[1])
+    part.write_bytes(cv2.imencode(".png", cv2.cvtColor(image, cv2.COLOR_RGB2BGR))[1].data)
     part.replace(path)
 
 
