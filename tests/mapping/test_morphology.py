@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
+
 import cv2
 import numpy as np
 import pytest
@@ -76,3 +79,12 @@ def test_chessboard_distances_to_occupied_cells_or_beyond(seed: int, share: floa
 
 def test_distances_fit_one_byte() -> None:
     assert chessboard_distances(np.zeros((700, 700), np.bool_)).max() == 255
+
+
+def test_opencv_is_loaded_when_it_is_needed() -> None:
+    """What only maps, and scores no map, does without."""
+    code = (
+        "import sys, replay.pipeline\nfrom mapping.mapper import make_mapper\n"
+        "make_mapper('det', 0.01, (-1.0, -1.0, 1.0, 1.0)).finish()\nassert 'cv2' not in sys.modules"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True)
