@@ -2,8 +2,7 @@
 
 The occupied cells are closed by a 3 x 3 kernel, and the outer contour of each connected component is approximated by
 a polygon (Douglas and Peucker). Three vertices give a triangle, four the rectangle of minimum area around the
-contour, more an ellipse fitted to it. Components larger than any primitive are walls. Needs OpenCV, which comes with
-the extra [train].
+contour, more an ellipse fitted to it. Components larger than any primitive are walls.
 """
 
 from __future__ import annotations

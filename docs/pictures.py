@@ -9,9 +9,9 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
-from PIL import Image, ImageDraw
 
 from bench.maps import probability, session_of
 from mapping.mapper import make_mapper
@@ -38,16 +38,17 @@ def maps(seed: int) -> list[list[NDArray[np.uint8]]]:
     return rows
 
 
-def draw(rows: list[list[NDArray[np.uint8]]]) -> Image.Image:
+def draw(rows: list[list[NDArray[np.uint8]]]) -> NDArray[np.uint8]:
     """Arrange the maps side by side, with labels."""
     height, width = rows[0][0].shape
-    picture = Image.new("L", (len(NOISE) * (width + GAP) + GAP, len(rows) * (height + LABEL + GAP) + GAP), 215)
-    pen = ImageDraw.Draw(picture)
+    shape = len(rows) * (height + LABEL + GAP) + GAP, len(NOISE) * (width + GAP) + GAP
+    picture = np.full(shape, 215, np.uint8)
     for i, (name, row) in enumerate(zip(ROWS, rows, strict=True)):
         for j, (noise_std, image) in enumerate(zip(NOISE, row, strict=True)):
             x, y = GAP + j * (width + GAP), GAP + i * (height + LABEL + GAP)
-            pen.text((x, y + 3), f"{name}, noise {noise_std * 1000:g} mm", fill=0)
-            picture.paste(Image.fromarray(image), (x, y + LABEL))
+            text = f"{name}, noise {noise_std * 1000:g} mm"
+            cv2.putText(picture, text, (x, y + LABEL - 5), cv2.FONT_HERSHEY_SIMPLEX, 0.4, (0,), lineType=cv2.LINE_AA)
+            picture[y + LABEL : y + LABEL + height, x : x + width] = image
     return picture
 
 
@@ -56,4 +57,4 @@ if __name__ == "__main__":
     parser.add_argument("picture", type=Path)
     parser.add_argument("--seed", type=int, default=10)
     options = parser.parse_args()
-    draw(maps(options.seed)).save(options.picture, optimize=True)
+    cv2.imwrite(str(options.picture), draw(maps(options.seed)), [cv2.IMWRITE_PNG_COMPRESSION, 9])

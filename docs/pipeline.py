@@ -10,8 +10,9 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
+import cv2
 import numpy as np
-from PIL import Image, ImageDraw
+from numpy.typing import NDArray
 
 from bench.maps import session_of
 from detect.detection import Detection
@@ -25,6 +26,9 @@ NOISE = {0.0: "n = 0", 0.05: "n = 0.05", 0.075: "n = 0.075", 0.1: "n = 0.1"}
 SCALE, GAP, LABEL = 2, 8, 20
 TRUTH = (140, 140, 140)
 SEED = 40_002
+
+Picture = NDArray[np.uint8]
+"""(rows, cols, 3), red first."""
 
 
 def networks(suite: Path, mapper: str, noise_std: float) -> Detector:
@@ -42,7 +46,7 @@ def networks(suite: Path, mapper: str, noise_std: float) -> Detector:
     return Detector.load(suite / "networks" / f"{mapper}-{trained}", mapper)
 
 
-def draw(grid: OccupancyGrid, found: tuple[Detection, ...], truth: tuple[Primitive, ...]) -> Image.Image:
+def draw(grid: OccupancyGrid, found: tuple[Detection, ...], truth: tuple[Primitive, ...]) -> Picture:
     """Draw a map with detections and true outlines.
 
     Args:
@@ -54,26 +58,35 @@ def draw(grid: OccupancyGrid, found: tuple[Detection, ...], truth: tuple[Primiti
         The picture, the largest y at the top.
     """
     grey = np.flipud(np.rint(255 * (1 - grid.probability)).astype(np.uint8))
-    picture = Image.fromarray(np.repeat(np.repeat(grey, SCALE, 0), SCALE, 1)).convert("RGB")
-    pen = ImageDraw.Draw(picture)
+    enlarged = cv2.resize(grey, None, fx=SCALE, fy=SCALE, interpolation=cv2.INTER_NEAREST)
+    picture = cv2.cvtColor(enlarged, cv2.COLOR_GRAY2RGB)
 
-    def corners(primitive: Primitive) -> list[tuple[float, float]]:
+    def corners(primitive: Primitive) -> NDArray[np.int32]:
         cells = primitive.outline() / grid.frame.resolution - (grid.frame.col, grid.frame.row)
-        return [(SCALE * x, SCALE * (grid.frame.rows - y)) for x, y in cells.tolist()]
+        return np.rint(SCALE * (cells * (1, -1) + (0, grid.frame.rows))).astype(np.int32)
 
-    for primitive in truth:
-        ring = corners(primitive)
-        for a, b in zip(ring, [*ring[1:], ring[0]], strict=True):
-            pen.line((a, b), fill=TRUTH, width=1)
+    cv2.polylines(picture, [corners(primitive) for primitive in truth], True, TRUTH)
     for detection in found:
         ring, colour = corners(detection.primitive), detection.primitive.kind.row.color
-        pen.line([*ring, ring[0]], fill=colour, width=2)
-        x, y = min(x for x, _ in ring), min(y for _, y in ring)
-        pen.text((x, y - 12), f"{detection.primitive.kind} {detection.score:.2f}", fill=colour)
+        cv2.polylines(picture, [ring], True, colour, 2, cv2.LINE_AA)
+        x, y = ring.min(axis=0).tolist()
+        write(picture, f"{detection.primitive.kind} {detection.score:.2f}", (x, y - 4), colour)
     return picture
 
 
-def pictures(suite: Path) -> Image.Image:
+def write(picture: Picture, text: str, place: tuple[int, int], colour: tuple[int, int, int]) -> None:
+    """Write into a picture.
+
+    Args:
+        picture: It is changed.
+        text: What is written.
+        place: Where it begins, on its base line: column and row.
+        colour: Red, green, blue.
+    """
+    cv2.putText(picture, text, place, cv2.FONT_HERSHEY_SIMPLEX, 0.4, colour, lineType=cv2.LINE_AA)
+
+
+def pictures(suite: Path) -> Picture:
     """Arrange the pictures of all mappers and noise levels side by side."""
     rows = []
     for mapper in MAPPERS:
@@ -87,14 +100,14 @@ def pictures(suite: Path) -> Image.Image:
             found = networks(suite, mapper, noise_std).detect(grid).found
             row.append(draw(grid, found, session.primitives))
         rows.append(row)
-    width, height = rows[0][0].size
-    sheet = Image.new("RGB", (len(NOISE) * (width + GAP) + GAP, len(rows) * (height + LABEL + GAP) + GAP), "white")
-    pen = ImageDraw.Draw(sheet)
+    height, width = rows[0][0].shape[:2]
+    shape = len(rows) * (height + LABEL + GAP) + GAP, len(NOISE) * (width + GAP) + GAP, 3
+    sheet = np.full(shape, 255, np.uint8)
     for i, (mapper, row) in enumerate(zip(MAPPERS, rows, strict=True)):
         for j, (name, picture) in enumerate(zip(NOISE.values(), row, strict=True)):
             x, y = GAP + j * (width + GAP), GAP + i * (height + LABEL + GAP)
-            pen.text((x, y + 4), f"{mapper}, {name}", fill="black")
-            sheet.paste(picture, (x, y + LABEL))
+            write(sheet, f"{mapper}, {name}", (x, y + LABEL - 6), (0, 0, 0))
+            sheet[y + LABEL : y + LABEL + height, x : x + width] = picture
     return sheet
 
 
@@ -103,4 +116,5 @@ if __name__ == "__main__":
     parser.add_argument("suite", type=Path)
     parser.add_argument("picture", type=Path)
     options = parser.parse_args()
-    pictures(options.suite).save(options.picture, optimize=True)
+    sheet = cv2.cvtColor(pictures(options.suite), cv2.COLOR_RGB2BGR)
+    cv2.imwrite(str(options.picture), sheet, [cv2.IMWRITE_PNG_COMPRESSION, 9])

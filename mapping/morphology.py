@@ -1,15 +1,15 @@
-"""Binary morphology of grids: dilation, neighbourhoods, connected components."""
+"""Binary morphology of grids, by OpenCV: dilation, neighbourhoods, connected components, distances.
+
+OpenCV is imported when it is needed: many replays need none of it.
+"""
 
 from __future__ import annotations
-
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from mapping.grid import GridFrame
 from prim.arrays import BoolGrid
-from prim.compiled import kernel
 
 
 def dilate(cells: BoolGrid, steps: int) -> BoolGrid:
@@ -22,15 +22,18 @@ def dilate(cells: BoolGrid, steps: int) -> BoolGrid:
     Returns:
         The marked cells and all within ``steps`` cells of them.
     """
-    grown = cells.copy()
-    for axis in (0, 1):
-        line = grown.copy()
-        for step in range(1, steps + 1):
-            ahead, behind = [slice(None)] * 2, [slice(None)] * 2
-            ahead[axis], behind[axis] = slice(step, None), slice(None, -step)
-            grown[tuple(ahead)] |= line[tuple(behind)]
-            grown[tuple(behind)] |= line[tuple(ahead)]
-    return grown
+    return _dilated(cells, np.ones((2 * steps + 1, 2 * steps + 1), np.uint8))
+
+
+def beside_free(free: BoolGrid) -> BoolGrid:
+    """Return which cells (rows, cols) have a free cell among their 4 neighbours."""
+    return _dilated(free, np.array([[0, 1, 0], [1, 0, 1], [0, 1, 0]], np.uint8))
+
+
+def _dilated(cells: BoolGrid, neighbours: NDArray[np.uint8]) -> BoolGrid:
+    import cv2
+
+    return cv2.dilate(cells.view(np.uint8), neighbours).view(np.bool_)
 
 
 def connected_components(
@@ -44,52 +47,30 @@ def connected_components(
         max_extent: A component is large where it extends over more than this (m) along an axis.
 
     Returns:
-        Labels (rows, cols) from 1 on, 0 where a cell is not occupied; and which cells (rows, cols) belong to large
-        components.
+        Labels (rows, cols) from 1 on, in the order of the components' first cells, 0 where a cell is not occupied;
+        and which cells (rows, cols) belong to large components.
     """
-    labels, large = np.zeros(occupied.shape, np.int32), np.zeros_like(occupied)
-    label_components(occupied, max_extent / frame.resolution, labels, large)
-    return labels, large
+    import cv2
+
+    cells = occupied.view(np.uint8)
+    # Wu's algorithm, of all that OpenCV has, numbers components in the order of their first cells
+    _, labels, boxes, _ = cv2.connectedComponentsWithStatsWithAlgorithm(cells, 8, cv2.CV_32S, cv2.CCL_WU)
+    is_large = boxes[:, [cv2.CC_STAT_WIDTH, cv2.CC_STAT_HEIGHT]].max(axis=1) > max_extent / frame.resolution
+    is_large[0] = False  # what is not occupied
+    return np.asarray(labels, dtype=np.int32), is_large[labels]
 
 
-@kernel
-def label_components(occupied: Any, max_extent: float, labels: Any, large: Any) -> None:
-    """Label connected components (8 neighbours) by flood fill.
+def chessboard_distances(occupied: BoolGrid) -> NDArray[np.uint8]:
+    """Compute the chessboard distance (cells) of each cell to the nearest occupied one, or to beyond the map.
 
     Args:
         occupied: Occupied cells (rows, cols).
-        max_extent: A component is large where it extends over more than this (cells) along an axis.
-        labels: Filled (rows, cols) with labels from 1 on; zeros beforehand.
-        large: Set (rows, cols) for cells of large components; False beforehand.
+
+    Returns:
+        The distances (rows, cols), at most those that one byte holds.
     """
-    rows, cols = occupied.shape
-    stack = np.empty((occupied.sum(), 2), np.int64)
-    label = 0
-    for row in range(rows):
-        for col in range(cols):
-            if not occupied[row, col] or labels[row, col]:
-                continue
-            label += 1
-            labels[row, col] = label
-            stack[0] = row, col
-            done, found = 0, 1
-            bottom, left, right = row, col, col
-            while done < found:
-                r, c = stack[done]
-                done += 1
-                bottom, left, right = max(bottom, r), min(left, c), max(right, c)
-                for near_r in range(max(r - 1, 0), min(r + 2, rows)):
-                    for near_c in range(max(c - 1, 0), min(c + 2, cols)):
-                        if occupied[near_r, near_c] and not labels[near_r, near_c]:
-                            labels[near_r, near_c] = label
-                            stack[found] = near_r, near_c
-                            found += 1
-            if max(bottom - row, right - left) + 1 > max_extent:
-                for cell in range(found):
-                    large[stack[cell, 0], stack[cell, 1]] = True
+    import cv2
 
-
-def beside_free(free: BoolGrid) -> BoolGrid:
-    """Return which cells (rows, cols) have a free cell among their 4 neighbours."""
-    padded = np.pad(free, 1)
-    return np.asarray(padded[:-2, 1:-1] | padded[2:, 1:-1] | padded[1:-1, :-2] | padded[1:-1, 2:])
+    others = np.pad(~occupied, 1).view(np.uint8)
+    distances = cv2.distanceTransform(others, cv2.DIST_C, cv2.DIST_MASK_3)[1:-1, 1:-1]
+    return np.minimum(distances, np.iinfo(np.uint8).max).astype(np.uint8)

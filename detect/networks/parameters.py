@@ -18,6 +18,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -45,7 +46,7 @@ class Preset:
     Attributes:
         name: Its name in PRESETS and in model cards.
         window: Side (cells) of the window around the box's centre.
-        pixels: Side (pixels) that the window is downsampled to.
+        pixels: Side (pixels) that the window is downsampled to, each the mean of a block of cells.
         isolated: Whether all but the box and a rim of one cell around it is blanked out as unknown.
         angle_as_vector: Whether the angle is encoded as cosine and sine.
         has_offset: Whether the centroid's offset from the window's centre is encoded.
@@ -123,37 +124,19 @@ def crop_box(image: NDArray[np.uint8], box: Box, preset: Preset) -> NDArray[np.u
     Returns:
         The crop (pixels, pixels).
     """
-    rows, cols = image.shape
-    x0, y0, x1, y1 = box
-    col, row = preset.window_origin(box)
-    window = np.full((preset.window, preset.window), UNKNOWN_GREY, np.uint8)
-    first_col, last_col, first_row, last_row = col, col + preset.window, row, row + preset.window
     if preset.isolated:
-        first_col, last_col = max(first_col, math.floor(x0) - 1), min(last_col, math.ceil(x1) + 1)
-        first_row, last_row = max(first_row, math.floor(y0) - 1), min(last_row, math.ceil(y1) + 1)
-    first_col, last_col = max(first_col, 0), min(last_col, cols)
-    first_row, last_row = max(first_row, 0), min(last_row, rows)
-    if first_col < last_col and first_row < last_row:
-        part = image[first_row:last_row, first_col:last_col]
-        window[first_row - row : last_row - row, first_col - col : last_col - col] = part
-    return downsample(window, preset.pixels)
-
-
-def downsample(window: NDArray[np.uint8], pixels: int) -> NDArray[np.uint8]:
-    """Downsample a square image by an integer factor.
-
-    Args:
-        window: The image (N, N).
-        pixels: Side of the result, a divisor of N.
-
-    Returns:
-        The image (pixels, pixels); each pixel is the mean of its block, rounded.
-    """
-    factor = len(window) // pixels
-    if factor == 1:
-        return window
-    blocks = window.reshape(pixels, factor, pixels, factor).astype(np.float32)
-    return np.asarray(np.rint(blocks.mean(axis=(1, 3))), dtype=np.uint8)
+        x0, y0, x1, y1 = box
+        rows, cols = (slice(max(math.floor(a) - 1, 0), max(math.ceil(b) + 1, 0)) for a, b in ((y0, y1), (x0, x1)))
+        own = np.full_like(image, UNKNOWN_GREY)
+        own[rows, cols] = image[rows, cols]
+        image = own
+    col, row = preset.window_origin(box)
+    shift, size = np.array([[1.0, 0.0, -col], [0.0, 1.0, -row]]), (preset.window, preset.window)
+    window = cv2.warpAffine(
+        image, shift, size, flags=cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT, borderValue=(UNKNOWN_GREY,)
+    )
+    crop = cv2.resize(window, (preset.pixels, preset.pixels), interpolation=cv2.INTER_AREA)
+    return np.asarray(crop, dtype=np.uint8)
 
 
 def encode_triangle(primitive: Primitive) -> list[float]:

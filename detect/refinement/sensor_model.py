@@ -43,8 +43,9 @@ from detect.refinement.kernels import (
 )
 from detect.refinement.options import DEFAULTS, SensorOptions
 from detect.refinement.rays import RayBundle
-from detect.refinement.traversal import cast_through_map, chessboard_distances
+from detect.refinement.traversal import cast_through_map
 from mapping.grid import GridFrame
+from mapping.morphology import chessboard_distances
 from prim.arrays import FloatArray
 from prim.shapes import Primitive
 
@@ -153,9 +154,7 @@ class DistanceMap:
         Returns:
             The map of distances.
         """
-        distances = np.empty(occupied.shape, np.uint8)
-        chessboard_distances(occupied, distances)
-        return cls(distances, frame)
+        return cls(chessboard_distances(occupied), frame)
 
     def background(self, bundle: RayBundle) -> Background:
         """Cast rays through the map; a cell says where its surface is to within a cell."""

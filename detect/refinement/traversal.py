@@ -1,4 +1,4 @@
-"""The compiled kernels that follow rays through a map's cells: distances to occupied cells, and ranges to them.
+"""The compiled kernel that follows rays through a map's cells to the occupied ones.
 
 Compiled code is cached beside this file and made anew when this file changes, so that nothing that stands elsewhere
 may be compiled in.
@@ -17,33 +17,6 @@ ORIGIN_X, ORIGIN_Y, DIRECTION_X, DIRECTION_Y = range(4)
 """Rows of rays (7, N), as in detect.refinement.kernels."""
 
 FAR = 1e30
-MAX_DISTANCE = 255
-"""Distances are stored in one byte."""
-
-
-@kernel
-def chessboard_distances(occupied: Any, out: Any) -> None:
-    """Compute the chessboard distance (cells) of each cell to the nearest occupied one, or to beyond the map.
-
-    The two passes of Rosenfeld and Pfaltz (1966).
-
-    Args:
-        occupied: (rows, cols) bool.
-        out: (rows, cols) uint8 gets the distances, at most MAX_DISTANCE.
-    """
-    rows, cols = occupied.shape
-    for r in range(rows):
-        for c in range(cols):
-            near = 0
-            if r > 0 and 0 < c < cols - 1:
-                near = min(out[r - 1, c - 1], out[r - 1, c], out[r - 1, c + 1], out[r, c - 1])
-            out[r, c] = 0 if occupied[r, c] else min(near + 1, MAX_DISTANCE)
-    for r in range(rows - 1, -1, -1):
-        for c in range(cols - 1, -1, -1):
-            near = 0
-            if r < rows - 1 and 0 < c < cols - 1:
-                near = min(out[r + 1, c - 1], out[r + 1, c], out[r + 1, c + 1], out[r, c + 1])
-            out[r, c] = min(out[r, c], near + 1)
 
 
 @kernel
@@ -53,7 +26,8 @@ def cast_through_map(distances: Any, grid: Any, rays: Any, max_ranges: Any, rang
     Over free space as many cells are taken at once as the distance to the nearest occupied one allows.
 
     Args:
-        distances: (rows, cols) of :func:`chessboard_distances`.
+        distances: (rows, cols) the chessboard distance (cells) of each cell to the nearest occupied one, or to beyond
+            the map; no longer than that.
         grid: row and column of the plane's cell at which the map begins, and 1 / resolution (1 / m).
         rays: (7, N).
         max_ranges: (N,) of the sensors (m).

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from detect.networks.parameters import Preset, crop_box
 from detect.networks.tiles import Box
-from detect.training.dataset import Sample, bounding_box
+from detect.training.dataset import Sample, bounding_box, read_image
 from mapping.grid import GridFrame
 from prim.shapes import Kind, Primitive
 
@@ -83,15 +83,13 @@ def collect_crops(samples: Sequence[Sample], kinds: Sequence[Kind]) -> CropSampl
     Returns:
         Their crops, in the order of the tiles.
     """
-    from PIL import Image
-
     images: list[NDArray[np.uint8]] = []
     items: list[tuple[int, GridFrame, Primitive]] = []
     for sample in samples:
         chosen = [primitive for primitive in sample.primitives if primitive.kind in kinds]
         if chosen:
             items += [(len(images), sample.frame, primitive) for primitive in chosen]
-            images.append(np.ascontiguousarray(np.asarray(Image.open(sample.image))[..., 0]))
+            images.append(np.ascontiguousarray(read_image(sample)[..., 0]))
     return CropSamples(tuple(images), tuple(items))
 
 

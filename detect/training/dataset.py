@@ -24,6 +24,7 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -371,10 +372,8 @@ def write_image(path: Path, image: NDArray[np.uint8]) -> None:
         path: Its file.
         image: (rows, cols, 3).
     """
-    from PIL import Image
-
     part = path.with_suffix(f".{os.getpid()}.part")
-    Image.fromarray(image).save(part, format="PNG")
+    part.write_bytes(cv2.imencode(".png", cv2.cvtColor(image, cv2.COLOR_RGB2BGR))[1].data)
     part.replace(path)
 
 
@@ -455,7 +454,17 @@ def _read_sample(folder: Path, mapper: str, split: str, path: Path) -> Sample:
 
 
 def read_image(sample: Sample) -> NDArray[np.uint8]:
-    """Read a sample's image (TILE_SIZE, TILE_SIZE, 3)."""
-    from PIL import Image
+    """Read a sample's image (TILE_SIZE, TILE_SIZE, 3).
 
-    return np.asarray(Image.open(sample.image))
+    Raises:
+        UsageError: The file is missing or damaged.
+    """
+    try:
+        image = cv2.imdecode(np.fromfile(sample.image, np.uint8), cv2.IMREAD_COLOR_RGB)
+    except (OSError, cv2.error):  # the latter where the file is empty
+        image = None
+    if image is None:
+        raise UsageError(
+            f"{sample.image} is missing or damaged: make the set in an empty folder with prim-train dataset"
+        )
+    return np.asarray(image, dtype=np.uint8)

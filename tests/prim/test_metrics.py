@@ -8,7 +8,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from mapping.map_metrics import map_scores
-from mapping.morphology import dilate
 from prim.metrics import detection_errors, match_primitives, polygon_iou, pose_rmse
 from prim.shapes import Kind, Primitive
 
@@ -111,17 +110,6 @@ def test_an_unknown_map_has_no_recall() -> None:
     assert scores.occupied_precision is None
     assert (scores.occupied_recall, scores.occupied_f1, scores.free_accuracy) == (0, 0, 0)
     assert scores.auc == 0.5
-
-
-@given(st.integers(0, 10**6), st.integers(1, 3))
-def test_dilation_reaches_all_eight_neighbours(seed: int, steps: int) -> None:
-    cells = np.random.default_rng(seed).random((7, 9)) < 0.08
-    grown = dilate(cells, steps)
-    rows, cols = np.nonzero(cells)
-    expected = np.zeros_like(cells)
-    for row, col in zip(rows, cols, strict=True):
-        expected[max(row - steps, 0) : row + steps + 1, max(col - steps, 0) : col + steps + 1] = True
-    assert (grown == expected).all()
 
 
 def test_pose_rmse_wraps_the_heading() -> None:

@@ -29,7 +29,7 @@ from detect.evaluation.sessions import (
 )
 from detect.networks.weights import KIND_NAMES, SHIPPED, ModelCard
 from detect.networks.yolo import KINDS
-from detect.training.dataset import DatasetOptions, bounding_box, load_samples, make_dataset
+from detect.training.dataset import DatasetOptions, bounding_box, load_samples, make_dataset, read_image
 from detect.training.thresholds import choose_thresholds
 from prim.errors import UsageError
 from prim.shapes import Kind, Primitive
@@ -49,9 +49,7 @@ def perfect_detector(folder: Path, score: float) -> Detector:
     """A detector whose YOLO outputs the true boxes of a data set's images with a given score."""
     truth = {}
     for sample in load_samples(folder, "det", "val"):
-        from PIL import Image
-
-        image = np.asarray(Image.open(sample.image)).transpose(2, 0, 1).astype(np.float32) / np.float32(255)
+        image = read_image(sample).transpose(2, 0, 1).astype(np.float32) / np.float32(255)
         truth[image.tobytes()] = [
             (KINDS.index(primitive.kind), bounding_box(primitive, sample.frame)) for primitive in sample.primitives
         ]

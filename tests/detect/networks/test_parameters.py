@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import shapely
-from hypothesis import assume, given
+from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
 from detect.networks.parameters import (
@@ -115,6 +115,28 @@ def test_the_papers_crop_is_isolated() -> None:
 def test_a_crop_at_the_border_is_unknown_beyond_it() -> None:
     made = crop_box(np.zeros((TILE_SIZE, TILE_SIZE), np.uint8), (-10.0, -10.0, 10.0, 10.0), PRIM)
     assert (made[:36, :36] == 128).all() and (made[36:, 36:] == 0).all()
+
+
+@given(
+    seed=st.integers(0, 10_000), x=st.floats(-150, 370), y=st.floats(-150, 370), preset=st.sampled_from((PRIM, PAPER))
+)
+@settings(max_examples=60, deadline=None)
+def test_a_crop_holds_the_cells_of_its_window(seed: int, x: float, y: float, preset: Preset) -> None:
+    """Cell by cell, also of boxes beyond the tile; a pixel is the mean of its block of cells."""
+    rng = np.random.default_rng(seed)
+    image = rng.integers(0, 256, (TILE_SIZE, TILE_SIZE), dtype=np.uint8)
+    width, height = rng.uniform(0, 90, 2)
+    box = x - width, y - height, x + width, y + height
+    col, row = preset.window_origin(box)
+    rows, cols = np.indices((preset.window, preset.window)) + np.array([row, col])[:, None, None]
+    shown = (rows >= 0) & (rows < TILE_SIZE) & (cols >= 0) & (cols < TILE_SIZE)
+    if preset.isolated:
+        shown &= (rows >= math.floor(box[1]) - 1) & (rows < math.ceil(box[3]) + 1)
+        shown &= (cols >= math.floor(box[0]) - 1) & (cols < math.ceil(box[2]) + 1)
+    cells = np.where(shown, image[np.clip(rows, 0, TILE_SIZE - 1), np.clip(cols, 0, TILE_SIZE - 1)], 128)
+    block = preset.window // preset.pixels
+    means = cells.reshape(preset.pixels, block, preset.pixels, block).mean(axis=(1, 3))
+    assert (crop_box(image, box, preset) == np.rint(means)).all()
 
 
 def test_tiles_cover_and_overlap() -> None:

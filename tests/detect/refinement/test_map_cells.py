@@ -4,28 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
-from scipy import ndimage
 
 from detect.refinement.lines import distance_to_line, trimmed_line
 from detect.refinement.map_cells import MapCells
 from mapping.grid import GridFrame, OccupancyGrid
-from mapping.morphology import label_components
 from tests.detect.refinement.rooms import mapped, room, scans
-
-
-@given(seed=st.integers(0, 10_000), share=st.floats(0, 0.6), most=st.integers(1, 40))
-@settings(max_examples=50, deadline=None)
-def test_connected_components_are_those_of_scipy(seed: int, share: float, most: int) -> None:
-    rng = np.random.default_rng(seed)
-    occupied = rng.random(rng.integers(1, 60, 2)) < share
-    labels, large = np.zeros(occupied.shape, np.int32), np.zeros_like(occupied)
-    label_components(occupied, float(most), labels, large)
-    expected, _ = ndimage.label(occupied, np.ones((3, 3)))
-    assert (labels == expected).all()
-    spans = [max(part.stop - part.start for part in parts) for parts in ndimage.find_objects(expected)]
-    assert (large == np.isin(expected, [k for k, span in enumerate(spans, start=1) if span > most])).all()
 
 
 @pytest.mark.parametrize("seed", range(3))

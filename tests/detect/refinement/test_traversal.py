@@ -9,7 +9,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from detect.refinement.traversal import cast_through_map, chessboard_distances
+from detect.refinement.traversal import cast_through_map
+from mapping.morphology import chessboard_distances
 
 
 def test_rays_end_in_the_first_occupied_cell_or_leave() -> None:
@@ -19,8 +20,7 @@ def test_rays_end_in_the_first_occupied_cell_or_leave() -> None:
     rays[:2] = 0.505
     rays[2:4] = [(1, -1, math.sqrt(0.5)), (0, 0, math.sqrt(0.5))]
     ranges, ends = np.zeros(3), np.zeros(3, np.bool_)
-    clear = np.empty(occupied.shape, np.uint8)
-    chessboard_distances(occupied, clear)
+    clear = chessboard_distances(occupied)
     cast_through_map(clear, (0, 0, 100.0), rays, np.full(3, 5.0), ranges, ends)
     assert ends.tolist() == [True, False, True]
     assert ranges[0] == pytest.approx(0.3, abs=0.0051) and ranges[1] == pytest.approx(0.505, abs=0.011)
@@ -35,8 +35,7 @@ def test_no_occupied_cell_is_passed(seed: int, share: float) -> None:
     """From within the map, from outside, and along its axes."""
     rng = np.random.default_rng(seed)
     occupied = rng.random((30, 40)) < share
-    clear = np.empty(occupied.shape, np.uint8)
-    chessboard_distances(occupied, clear)
+    clear = chessboard_distances(occupied)
     rays = np.zeros((7, 40))
     rays[:2] = rng.uniform(-5, 45, (2, 40))
     angle = np.where(rng.random(40) < 0.2, rng.integers(0, 4, 40) * math.pi / 2, rng.uniform(0, 2 * math.pi, 40))
@@ -56,14 +55,3 @@ def test_no_occupied_cell_is_passed(seed: int, share: float) -> None:
             assert occupied[place]
         else:
             assert not met.any()
-
-
-def test_chessboard_distances_to_occupied_cells_or_beyond() -> None:
-    occupied = np.zeros((9, 12), np.bool_)
-    occupied[4, 7] = True
-    clear = np.empty(occupied.shape, np.uint8)
-    chessboard_distances(occupied, clear)
-    rows, cols = np.indices(occupied.shape)
-    to_cell = np.maximum(abs(rows - 4), abs(cols - 7))
-    beyond = np.minimum(np.minimum(rows, 8 - rows), np.minimum(cols, 11 - cols)) + 1
-    assert (clear == np.minimum(to_cell, beyond)).all()

@@ -3,14 +3,23 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
-from PIL import Image
 
 from detect.training.crops import collect_crops
-from detect.training.dataset import DatasetOptions, load_samples, make_dataset, session_options, session_seeds
+from detect.training.dataset import (
+    DatasetOptions,
+    load_samples,
+    make_dataset,
+    read_image,
+    session_options,
+    session_seeds,
+    write_image,
+)
 from prim.errors import UsageError
 from prim.shapes import Kind
 
@@ -31,7 +40,7 @@ def test_a_data_set_holds_images_labels_and_primitives(small: Path) -> None:
         train, val = load_samples(small, mapper, "train"), load_samples(small, mapper, "val")
         assert (len(train), len(val)) == (2, 1)
         for sample in train + val:
-            image = np.asarray(Image.open(sample.image))
+            image = read_image(sample)
             assert image.shape == (224, 224, 3)
             labels = sample.image.parents[3] / "labels" / mapper / sample.image.parent.name
             lines = (labels / f"{sample.image.stem}.txt").read_text().splitlines()
@@ -39,6 +48,25 @@ def test_a_data_set_holds_images_labels_and_primitives(small: Path) -> None:
     assert [sample.primitives for sample in load_samples(small, "det", "train")] == [
         sample.primitives for sample in load_samples(small, "forward", "train")
     ]
+
+
+def test_an_image_is_read_as_it_was_written(small: Path, tmp_path: Path) -> None:
+    """In the same order of channels, by other readers of PNG files, too."""
+    image = np.random.default_rng(0).integers(0, 256, (20, 30, 3), dtype=np.uint8)
+    sample = replace(load_samples(small, "det", "val")[0], image=tmp_path / "a.png")
+    write_image(sample.image, image)
+    assert (read_image(sample) == image).all()
+    assert (cv2.imread(str(sample.image))[..., ::-1] == image).all()
+    assert [path.name for path in tmp_path.iterdir()] == ["a.png"]
+
+
+@pytest.mark.parametrize("content", [None, b"", b"\x89PNG\r\n\x1a\n", b"no image"])
+def test_a_damaged_image_is_refused(small: Path, tmp_path: Path, content: bytes | None) -> None:
+    sample = replace(load_samples(small, "det", "val")[0], image=tmp_path / "a.png")
+    if content is not None:
+        sample.image.write_bytes(content)
+    with pytest.raises(UsageError, match=r"a\.png is missing or damaged"):
+        read_image(sample)
 
 
 def test_a_data_set_is_continued_and_reproducible(small: Path, tmp_path: Path) -> None:
