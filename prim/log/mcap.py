@@ -156,7 +156,7 @@ class McapReader:
         """Yield messages in the order of log times, by the index of chunks.
 
         mcap's own iter_messages makes an object of every record and sorts them in a heap. Without it scans of 500
-        beams are decoded 2.1 times as fast (python -m bench.speed, the row «reading»), which saves a replay of 10,000
+        beams are decoded twice as fast (python -m bench.speed, the row «reading»), which saves a replay of 10,000
         of them by det a seventh of its CPU time.
         """
         chunks = sorted(summary.chunk_indexes, key=lambda index: index.message_start_time)
