@@ -16,7 +16,7 @@ import rerun as rr
 from docs.architecture import DETECTION, PICTURE, SCAN, picture
 from prim import __version__
 
-ROOT = Path(__file__).parents[1]
+ROOT = Path(__file__).parents[2]
 DOCUMENTS = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").glob("**/*.md")])
 CODE = ("prim", "recorder", "mapping", "detect", "replay", "tests", "bench", "docs")
 
