@@ -13,9 +13,9 @@ export PIP_DISABLE_PIP_VERSION_CHECK := 1
 demo: .venv/installed
 	@mkdir -p demo
 	$(BIN)/prim-record demo/session.mcap --seed $(SEED) --noise-std $(NOISE_STD)
-	cd demo && for mapper in det prob; do ../$(BIN)/prim-replay session.mcap --mapper $$mapper --quiet || exit 1; done
-	cd demo && ../$(BIN)/prim-replay session.mcap --mapper forward --detect-every 10
-	@echo "open it: $(BIN)/rerun demo/session.forward.rrd"
+	cd demo && ../$(BIN)/prim-replay session.mcap --mapper det,prob,forward
+	cd demo && ../$(BIN)/prim-replay session.mcap --mapper forward
+	@echo "open it: $(BIN)/rerun demo/session.forward.rrd (all mappers: demo/session.det-prob-forward.rrd)"
 	@$(BIN)/python docs/screenshot.py demo/session.forward.rrd demo/session.forward.png; case $$? in \
 	  0) echo "picture: demo/session.forward.png" ;; \
 	  4) ;; \
