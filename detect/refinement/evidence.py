@@ -87,9 +87,19 @@ def laplace_evidence(fit: KindFit, dispersion: float = 1.0, options: EvidenceOpt
         Nats.
     """
     size = len(fit.information)
-    _, log_determinant = np.linalg.slogdet(fit.information / dispersion + np.eye(size))
-    volume = 0.5 * (size * math.log(2 * math.pi) - log_determinant)
+    volume = 0.5 * (size * math.log(2 * math.pi) - _log_determinant(fit.information / dispersion + np.eye(size)))
     return float(-fit.cost / dispersion + volume + log_prior(fit.kind, options))
+
+
+def _log_determinant(matrix: FloatArray) -> float:
+    """Return the logarithm of the determinant of an information matrix (K, K) to which the unit matrix was added.
+
+    Its eigenvalues are at least 1, which rounding can hide where the largest is beyond 1e16 times as large.
+    """
+    sign, log_determinant = np.linalg.slogdet(matrix)
+    if sign > 0:
+        return float(log_determinant)
+    return float(np.log(np.maximum(np.linalg.eigvalsh(matrix), 1.0)).sum())
 
 
 @dataclass(frozen=True)

@@ -8,8 +8,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from detect.refinement.evidence import KindPosterior, _merged_special_cases, log_prior, max_size
-from detect.refinement.fit import SPECIAL_CASES
+from detect.refinement.evidence import (
+    KindPosterior,
+    _merged_special_cases,
+    laplace_evidence,
+    log_prior,
+    max_size,
+)
+from detect.refinement.fit import SPECIAL_CASES, KindFit
 from detect.refinement.options import DEFAULTS
 from prim.shapes import Kind, Primitive
 
@@ -54,3 +60,18 @@ class FakeFit:
 
     def __init__(self, kind: Kind) -> None:
         self.kind = kind
+
+
+@pytest.mark.parametrize("largest", [1e3, 1e12, 3e16, 1e20])
+def test_evidence_is_finite_however_much_the_rays_say_of_one_direction(largest: float) -> None:
+    """Rays that touch a shape tell one direction of its parameters a million times as well as the others."""
+    rng = np.random.default_rng(0)
+    for _ in range(50):
+        axes = np.linalg.qr(rng.normal(size=(4, 4)))[0]
+        values = np.array([largest, 1e5, 1.0, 0.0])
+        information = (axes * values) @ axes.T
+        fit = KindFit(Kind.SQUARE, np.array([3.6, 2.5, 0.3, 0.05, 0.05]), 634.0, information)
+        expected = -634.0 + 2 * math.log(2 * math.pi) - np.log(values + 1).sum() / 2 + log_prior(Kind.SQUARE)
+        assert laplace_evidence(fit) == pytest.approx(
+            expected, abs=8.0
+        )  # half of what rounding hides: ln 1e7 at most
