@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -16,8 +16,10 @@ from prim.arrays import FloatArray
 from prim.choices import MapperName
 from prim.errors import UsageError
 from prim.metrics import DetectionErrors, detection_errors
-from prim.scan import PosedScan
+from prim.scan import PosedScan, Scan
+from prim.se2 import Pose2D
 from prim.shapes import Primitive
+from prim.threads import preload
 from replay.detection_refiner import DetectionRefiner
 from replay.ground_truth import GroundTruth
 from replay.options import ReplayOptions
@@ -28,6 +30,7 @@ if TYPE_CHECKING:
     from detect.detection import Detections
     from detect.detector import Detector
     from detect.tracker import Tracker
+    from replay.moved_primitives import MovedPrimitives
 
 
 @dataclass(frozen=True)
@@ -74,6 +77,8 @@ class DetectionStage:
         truth: The true world, in coordinates of the map; None where it is not known.
         frame_covariance: The covariance (3, 3; m, rad) of the map frame's own pose; None where it is exact.
         timer: Counts the time towards the stages «detect» and «refine».
+        pose_std: Standard deviations of the poses' positions (m) and headings (rad); None where they are not known,
+            so that nothing is known to move.
     """
 
     skipped: str | None = None
@@ -86,12 +91,16 @@ class DetectionStage:
         truth: GroundTruth | None,
         frame_covariance: FloatArray | None,
         timer: StageTimer,
+        pose_std: tuple[float, float] | None = None,
     ) -> None:
         self._detector = detector
         self._interval = options.detect_every
         self._own_mapper = _own_mapper(detector, options, frame)
-        self._refiner = DetectionRefiner(options.noise_std, frame_covariance) if options.refine else None
-        self._tracker = _tracker() if self._interval else None
+        moved = None
+        if options.refine and self.streaming and pose_std is not None:
+            moved = _moved_primitives(detector, options, frame, pose_std)
+        self._refiner = DetectionRefiner(options.noise_std, frame_covariance, moved) if options.refine else None
+        self._tracker = preload(_tracker) if self.streaming else None
         self._truth = truth
         self._timer = timer
 
@@ -141,34 +150,33 @@ class DetectionStage:
             detections = self._detector.detect(grid)
         noise_std = None
         if self._refiner:
-            pieces = (piece for posed in posed_scans for piece in posed.pieces)
             with self._timer.stage("refine"):
-                detections, noise_std = self._refiner.refine(detections, grid, pieces)
+                detections, noise_std = self._refiner.refine(detections, grid, lambda: _pieces(posed_scans))
         return self._result(detections, int(posed_scans.scan_log.stamps[-1]), noise_std)
 
     def _add(self, posed: PosedScan) -> None:
         """Add a scan to the detector's own map, and to those that refine detections before the last scan."""
         for scan, pose in posed.pieces:
             if self._refiner and self.streaming:
-                self._refiner.scans.add(scan, pose)
+                self._refiner.add(scan, pose)
             if self._own_mapper is not None:
                 (self._own_mapper.update if self.streaming else self._own_mapper.accumulate)(scan, pose)
 
     def _result(self, detections: Detections, stamp: int, noise_std: float | None) -> DetectionResult:
         """Identify the detections' tracks, and evaluate them against the truth at ``stamp`` (ns)."""
         with self._timer.stage("detect"):
-            identities = self._identities(detections)
+            identities = self._identities(detections, stamp)
             if self._truth is None:
                 return DetectionResult(detections, identities, noise_std)
             truth = tuple(self._truth.at(stamp).primitives)
             errors = detection_errors([detection.primitive for detection in detections.found], truth)
             return DetectionResult(detections, identities, noise_std, truth, errors)
 
-    def _identities(self, detections: Detections) -> tuple[TrackIdentity, ...]:
+    def _identities(self, detections: Detections, stamp: int) -> tuple[TrackIdentity, ...]:
         """Return the track of each detection; without a tracker, number them in their order."""
         if self._tracker is None:
             return tuple(TrackIdentity(number) for number in range(1, len(detections.found) + 1))
-        tracks = self._tracker.update(detections.found)
+        tracks = self._tracker.result().update(detections.found, stamp)
         return tuple(TrackIdentity(track.id, track.confirmed, track.std) for track in tracks)
 
 
@@ -197,6 +205,7 @@ def make_detection_stage(
     truth: GroundTruth | None,
     frame_covariance: FloatArray | None,
     timer: StageTimer,
+    pose_std: tuple[float, float] | None = None,
 ) -> DetectionStage | NoDetection:
     """Make the stage that detects, with the weights that are named or those that come with prim.
 
@@ -206,6 +215,8 @@ def make_detection_stage(
         truth: The true world, in coordinates of the map; None where it is not known.
         frame_covariance: The covariance (3, 3; m, rad) of the map frame's own pose; None where it is exact.
         timer: Counts the time of loading towards the stage «detect».
+        pose_std: Standard deviations of the poses' positions (m) and headings (rad); None where they are not known,
+            so that nothing is known to move.
 
     Returns:
         The stage; a :class:`NoDetection` where detection is not wanted, or where it was not explicitly asked for and
@@ -224,7 +235,7 @@ def make_detection_stage(
         if weights is None:
             raise UsageError(f"no weights for maps of {options.mapper} come with prim: give --weights")
         detector = _load(weights, options.mapper, timer)
-        return DetectionStage(detector, options, frame, truth, frame_covariance, timer)
+        return DetectionStage(detector, options, frame, truth, frame_covariance, timer, pose_std)
     except UsageError as error:
         if explicit:
             raise
@@ -239,9 +250,28 @@ def _load(weights: Path, mapper: str, timer: StageTimer) -> Detector:
 
 
 def _tracker() -> Tracker:
-    from detect.tracker import Tracker
+    from detect.tracker import Tracker  # in a thread: it imports filterpy, which takes most of a second
 
     return Tracker()
+
+
+def _moved_primitives(
+    detector: Detector, options: ReplayOptions, frame: GridFrame, pose_std: tuple[float, float]
+) -> MovedPrimitives:
+    """Make the part that refines what moves, with maps as the networks were trained on."""
+    from replay.moved_primitives import MovedPrimitives  # as all that refinement needs
+
+    def make_map(scans: Iterable[tuple[Scan, Pose2D]]) -> OccupancyGrid:
+        mapper = _detectors_mapper(detector, options, frame)
+        for scan, pose in scans:
+            mapper.accumulate(scan, pose)
+        return mapper.finish()
+
+    return MovedPrimitives(make_map, detector.detect, pose_std)
+
+
+def _pieces(posed_scans: PosedScans) -> Iterator[tuple[Scan, Pose2D]]:
+    return (piece for posed in posed_scans for piece in posed.pieces)
 
 
 def _own_mapper(detector: Detector, options: ReplayOptions, frame: GridFrame) -> Mapper | None:
@@ -249,5 +279,11 @@ def _own_mapper(detector: Detector, options: ReplayOptions, frame: GridFrame) ->
     cell = detector.card.resolution
     if np.isclose(options.resolution, cell, rtol=1e-6) and options.sensor_model == "eq4":
         return None
+    return _detectors_mapper(detector, options, frame)
+
+
+def _detectors_mapper(detector: Detector, options: ReplayOptions, frame: GridFrame) -> Mapper:
+    """Make a mapper of the kind and the cells that the detector was trained on."""
+    cell = detector.card.resolution
     noise_std = options.noise_std if options.mapper == MapperName.FORWARD else None
     return make_mapper(options.mapper, cell, GridFrame.covering(frame.bounds, cell).bounds, "eq4", noise_std)

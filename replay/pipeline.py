@@ -174,7 +174,7 @@ class Pipeline:
     ) -> DetectionStage | NoDetection:
         """Make the stage that detects primitives, in the map so far and in the final one."""
         truth = evaluator.comparable_truth
-        return make_detection_stage(self.options, frame, truth, poses.frame_covariance, self._timer)
+        return make_detection_stage(self.options, frame, truth, poses.frame_covariance, self._timer, poses.max_std)
 
     def _make_mapping_stage(
         self, frame: GridFrame, posed_scans: PosedScans, detection: DetectionStage | NoDetection
