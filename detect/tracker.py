@@ -8,8 +8,9 @@ of the detection and whose velocity is constant but for white acceleration noise
 that is where the last one was makes it a standing one again. The kind of a track is the one with the largest sum of
 scores.
 
-Detections are associated with tracks by greedy nearest neighbour within a gate. For those that are left there is a
-wider gate: what may have been pushed since its track was detected last, if kind and sizes agree.
+Detections are associated with tracks by greedy nearest neighbour: first within a narrow gate where kind and sizes
+agree; then, if they do, within a wide gate, as far as the primitive may have been pushed since it was detected last;
+then within the narrow gate where they do not agree.
 
 Track management, counted in updates (one for each time that the detector runs on the map):
 
@@ -350,20 +351,14 @@ class Tracker:
         return track
 
     def _associate(self, detections: Sequence[Detection], stamp: int) -> dict[int, Track]:
-        """Return tracks by index of the detection.
-
-        The narrow gate goes before the wide one, confirmed tracks before tentative ones, then the nearest in place
-        and size.
-        """
+        """Return tracks by index of the detection: by rank, confirmed tracks first, then the nearest."""
         pairs = []
         for index, detection in enumerate(detections):
-            primitive = detection.primitive
             for track in self.tracks:
-                wide = self._gate(primitive, track, stamp)
-                if wide is not None:
-                    unlike = abs(primitive.bounding_radius - track.primitive.bounding_radius)
-                    cost = track.distance(primitive, stamp) + unlike
-                    pairs.append((wide, not track.confirmed, cost, index, track))
+                rank = self._rank(detection.primitive, track, stamp)
+                if rank is not None:
+                    distance = track.distance(detection.primitive, stamp)
+                    pairs.append((rank, not track.confirmed, distance, index, track))
         chosen: dict[int, Track] = {}
         assigned: set[int] = set()
         for _, _, _, index, track in sorted(pairs, key=lambda pair: pair[:4]):
@@ -372,14 +367,17 @@ class Tracker:
                 assigned.add(track.id)
         return chosen
 
-    def _gate(self, detected: Primitive, track: Track, stamp: int) -> bool | None:
-        """Return whether a detection is in a track's wide gate alone; None where it is in neither."""
-        distance, options = track.distance(detected, stamp), self.options
-        if distance <= _narrow_gate(detected, track.primitive, options):
-            return False
-        reach = _seconds(track.stamp, stamp) * options.max_speed
+    def _rank(self, detected: Primitive, track: Track, stamp: int) -> int | None:
+        """Return the rank of an association, 0 the best; None where it is impossible.
+
+        In the narrow gate are 0, where kind and sizes agree, and 2, where they do not; in the wide one is 1.
+        """
+        options, distance = self.options, track.distance(detected, stamp)
         alike = _is_alike(detected, track.primitive, options.max_size_ratio)
-        return True if track.confirmed and alike and distance <= reach else None
+        if distance <= _narrow_gate(detected, track.primitive, options):
+            return 0 if alike else 2
+        reach = _seconds(track.stamp, stamp) * options.max_speed
+        return 1 if track.confirmed and alike and distance <= reach else None
 
 
 def _seconds(before: int, now: int) -> float:

@@ -108,6 +108,7 @@ class MovedPrimitives:
         found = look.detections.found
         judged = self._judge(found, look.recent, look.grid, look.noise_std)
         stands = [d for d, judgement in zip(found, judged, strict=True) if judgement.verdict is Verdict.STANDS]
+        self._moved = tuple(moved for moved in self._moved if not self._stood_always(moved, stands, look))
         if len(stands) == len(found) and not self._moved:
             return look.detections
         self._moved = self._refine_moved(look, judged, stands, scans, effort)
@@ -121,6 +122,13 @@ class MovedPrimitives:
         return replace(
             look.detections, found=tuple(answer), rejected=tuple(_by_score([*look.detections.rejected, *dropped]))
         )
+
+    def _stood_always(self, moved: Detection, stands: Sequence[Detection], look: Look) -> bool:
+        """Return whether the scans before something moved agree, too, with what was refined in its place by all."""
+        rivals = [detection for detection in stands if self._shares(detection, [moved])]
+        older = [piece for piece in look.scans if moved.since is not None and piece[0].stamp < moved.since]
+        judged = self._judge(rivals, older, look.grid, look.noise_std)
+        return any(judgement.verdict is Verdict.STANDS for judgement in judged)
 
     def _refine_moved(
         self,
