@@ -124,11 +124,13 @@ class MovedPrimitives:
         )
 
     def _stood_always(self, moved: Detection, stands: Sequence[Detection], look: Look) -> bool:
-        """Return whether the scans before something moved agree, too, with what was refined in its place by all."""
+        """Return whether what was refined by all scans in the place of something that moved stood there all along."""
         rivals = [detection for detection in stands if self._shares(detection, [moved])]
-        older = [piece for piece in look.scans if moved.since is not None and piece[0].stamp < moved.since]
-        judged = self._judge(rivals, older, look.grid, look.noise_std)
-        return any(judgement.verdict is Verdict.STANDS for judgement in judged)
+        since = moved.since or look.since
+        older = [piece for piece in look.scans if piece[0].stamp < since]
+        later = [piece for piece in look.scans if piece[0].stamp >= since]
+        before, after = (self._judge(rivals, scans, look.grid, look.noise_std) for scans in (older, later))
+        return any(first.is_seen and second.is_seen for first, second in zip(before, after, strict=True))
 
     def _refine_moved(
         self,

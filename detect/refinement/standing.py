@@ -46,10 +46,17 @@ class Judgement:
     Attributes:
         verdict: Whether it stands there.
         nearby: The primitive at the likeliest place nearby.
+        log_ratio: Log-likelihood ratio of the rays with the primitive against nothing in its place (nats).
     """
 
     verdict: Verdict
     nearby: Primitive
+    log_ratio: float = 0.0
+
+    @property
+    def is_seen(self) -> bool:
+        """Whether the rays show that it stands, not merely nothing else."""
+        return self.verdict is Verdict.STANDS and self.log_ratio > 0
 
 
 def judge_places(
@@ -101,10 +108,10 @@ def _judge(candidate: Candidate, candidates: Sequence[Candidate], sensor: BeamMo
     here, there = exact_costs(kind, np.stack([p, fit.p]), bundle, sensor, candidate.options.evidence).tolist()
     nearby, nothing = primitive_of(kind, fit.p), float(-bundle.rays[BACKGROUND].sum())
     if min(here, there) - nothing > limits.min_nats_against:
-        return Judgement(Verdict.GONE, start)
+        return Judgement(Verdict.GONE, start, nothing - here)
     if here - there > limits.min_gain and _is_displaced(start, nearby, slack, limits):
-        return Judgement(Verdict.MOVED, nearby)
-    return Judgement(Verdict.STANDS, start)
+        return Judgement(Verdict.MOVED, nearby, nothing - here)
+    return Judgement(Verdict.STANDS, start, nothing - here)
 
 
 def _is_displaced(before: Primitive, after: Primitive, slack: float, limits: StandingOptions) -> bool:

@@ -91,7 +91,7 @@ def test_a_replay_writes_a_recording_and_a_report_by_default(
         ("--no-viewer", {"rerun", "torch", "ultralytics", "matplotlib", "filterpy"}, {"report.json"}),
         (
             "--no-viewer --no-detect",
-            {"rerun", "torch", "matplotlib", "filterpy", "scipy", "shapely", "onnxruntime"},
+            {"rerun", "torch", "matplotlib", "filterpy", "shapely", "onnxruntime"},
             {"report.json"},
         ),
     ],

@@ -122,11 +122,11 @@ def test_the_place_of_a_pushed_primitive_follows_within_two_looks(looks: list[De
         abs(b.truth[PUSHED].x - a.truth[PUSHED].x) + abs(b.truth[PUSHED].y - a.truth[PUSHED].y)
         for a, b in pairwise(looks)
     ]
-    last = max(k for k, step in enumerate(steps) if step > 1e-3) + 1
-    for result in looks[last + 1 :]:
-        distance, _, detection = nearest(result, PUSHED)
-        assert distance < 0.04 and detection.primitive.kind is result.truth[PUSHED].kind
-        assert detection.since is not None
+    first = max(k for k, step in enumerate(steps) if step > 1e-3) + 1
+    distances = [nearest(result, PUSHED)[0] for result in looks[first + 1 :]]
+    assert max(distances) < 0.04 and np.median(distances) < 0.003
+    ids = [nearest(result, PUSHED)[1] for result in looks[first + 2 :]]
+    assert len(set(ids)) == 1
 
 
 def test_a_pushed_primitive_is_refined_by_the_scans_since(looks: list[DetectionResult]) -> None:
