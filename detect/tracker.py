@@ -9,8 +9,9 @@ that is where the last one was makes it a standing one again. The kind of a trac
 scores.
 
 Detections are associated with tracks by greedy nearest neighbour: first within a narrow gate where kind and sizes
-agree; then, if they do, within a wide gate, as far as the primitive may have been pushed since it was detected last;
-then within the narrow gate where they do not agree.
+agree, then where they do not. Where they agree there is a wide gate, too, as far as the primitive may have been
+pushed since it was detected last: of what refinement knows to have moved (``Detection.since``) it goes before the
+narrow gate without agreement, of the rest behind it.
 
 Track management, counted in updates (one for each time that the detector runs on the map):
 
@@ -18,7 +19,8 @@ Track management, counted in updates (one for each time that the detector runs o
 - a track is confirmed by its ``confirm_after``-th detection; a tentative one without a detection is deleted;
 - a confirmed one is deleted after ``delete_after`` consecutive updates without a detection.
 
-Importing filterpy takes most of a second: what makes tracks imports this module in a thread (replay.detection_stage).
+Importing filterpy takes some tenths of a second: what makes tracks imports this module in a thread
+(replay.detection_stage).
 """
 
 from __future__ import annotations
@@ -355,7 +357,7 @@ class Tracker:
         pairs = []
         for index, detection in enumerate(detections):
             for track in self.tracks:
-                rank = self._rank(detection.primitive, track, stamp)
+                rank = self._rank(detection, track, stamp)
                 if rank is not None:
                     distance = track.distance(detection.primitive, stamp)
                     pairs.append((rank, not track.confirmed, distance, index, track))
@@ -367,17 +369,21 @@ class Tracker:
                 assigned.add(track.id)
         return chosen
 
-    def _rank(self, detected: Primitive, track: Track, stamp: int) -> int | None:
+    def _rank(self, detection: Detection, track: Track, stamp: int) -> int | None:
         """Return the rank of an association, 0 the best; None where it is impossible.
 
-        In the narrow gate are 0, where kind and sizes agree, and 2, where they do not; in the wide one is 1.
+        In the narrow gate are 0, where kind and sizes agree, and 2, where they do not; in the wide one are 1, if it
+        is known that the detected primitive moved, and 3.
         """
-        options, distance = self.options, track.distance(detected, stamp)
-        alike = _is_alike(detected, track.primitive, options.max_size_ratio)
-        if distance <= _narrow_gate(detected, track.primitive, options):
+        options, primitive = self.options, detection.primitive
+        distance = track.distance(primitive, stamp)
+        alike = _is_alike(primitive, track.primitive, options.max_size_ratio)
+        if distance <= _narrow_gate(primitive, track.primitive, options):
             return 0 if alike else 2
         reach = _seconds(track.stamp, stamp) * options.max_speed
-        return 1 if track.confirmed and alike and distance <= reach else None
+        if not (track.confirmed and alike and distance <= reach):
+            return None
+        return 3 if detection.since is None else 1
 
 
 def _seconds(before: int, now: int) -> float:

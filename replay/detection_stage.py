@@ -250,7 +250,7 @@ def _load(weights: Path, mapper: str, timer: StageTimer) -> Detector:
 
 
 def _tracker() -> Tracker:
-    from detect.tracker import Tracker  # in a thread: it imports filterpy, which takes most of a second
+    from detect.tracker import Tracker  # in a thread: it imports filterpy, which takes some tenths of a second
 
     return Tracker()
 

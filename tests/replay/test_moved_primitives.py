@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from detect.detection import Detection
+from detect.refinement.rays import collect_rays
 from detect.refinement.standing import Verdict, judge_places
 from mapping.mapper import make_mapper
 from prim.scan import Scan
@@ -56,6 +57,12 @@ def test_what_stands_is_told_from_what_was_moved_and_what_is_gone() -> None:
     assert verdicts([turned], scans) == [Verdict.MOVED]
     away = replace(CIRCLE, x=0.0, y=-0.1)
     assert verdicts([SQUARE, away], scans) == [Verdict.STANDS, Verdict.GONE]
+
+
+def test_each_primitive_has_the_rays_of_the_scans_since_its_own_stamp() -> None:
+    scans = scans_of(SQUARE, CIRCLE)
+    (early, late), _, _ = collect_rays(scans, [SQUARE, CIRCLE], 0.03, since=[None, 8])
+    assert set(early.scan.tolist()) == {*range(1, 13)} and set(late.scan.tolist()) == {9, 10, 11, 12}
 
 
 def test_errors_of_poses_are_no_motion() -> None:
