@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from prim.arrays import FloatArray
 from prim.shapes import Kind, Primitive
 from prim.world import Bounds
 
@@ -24,6 +25,9 @@ class Detection:
             networks had not detected the primitive.
         std: Standard deviations (m, rad) of the parameters by name; None where nothing was refined.
         kind_probabilities: Posterior probabilities of the kinds; None where nothing was refined.
+        covariance: (K, K) of the parameters in the kind's order (m, rad); None where nothing was refined. ``std`` has
+            the square roots of its diagonal.
+        since: Stamp (ns) of the scan from which on it stands there, by which it is refined; None for all scans.
     """
 
     primitive: Primitive
@@ -32,6 +36,8 @@ class Detection:
     crop: NDArray[np.uint8]
     std: Mapping[str, float] | None = None
     kind_probabilities: Mapping[Kind, float] | None = None
+    covariance: FloatArray | None = None
+    since: int | None = None
 
 
 @dataclass(frozen=True)

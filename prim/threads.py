@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Callable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
+from typing import TypeVar
+
+Made = TypeVar("Made")
 
 
 def cores() -> int:
@@ -21,3 +24,18 @@ def worker_pool(threads: int) -> Iterator[ThreadPoolExecutor | None]:
         return
     with ThreadPoolExecutor(threads) as pool:
         yield pool
+
+
+def preload(make: Callable[[], Made]) -> Future[Made]:
+    """Make something in a thread of its own, such as what needs a slow import, while other work goes on.
+
+    Args:
+        make: Makes it.
+
+    Returns:
+        Its ``result()`` is what was made, or raises what went wrong.
+    """
+    pool = ThreadPoolExecutor(1)
+    future = pool.submit(make)
+    pool.shutdown(wait=False)
+    return future

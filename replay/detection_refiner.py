@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import math
-from collections.abc import Iterable, Mapping
+from collections import deque
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
@@ -13,12 +13,12 @@ from mapping.grid import OccupancyGrid
 from prim.arrays import FloatArray
 from prim.scan import Scan
 from prim.se2 import Pose2D, frame_covariances
-from prim.shapes import Primitive
 from prim.threads import cores
 
 if TYPE_CHECKING:
-    from detect.detection import Detections
+    from detect.detection import Detection, Detections
     from detect.refinement.refine import Effort
+    from replay.moved_primitives import MovedPrimitives
 
 
 @dataclass(frozen=True)
@@ -30,6 +30,7 @@ class IntermediateOptions:
         kind_search_growth: Kinds of primitives whose kind was certain are compared again once the number of scans has
             grown by this factor since they were last.
         proposals: At most this many connected components of the map that the networks missed are tried.
+        recent_scans: What moved is looked for in the scans since the last look, but in so many at least.
         proposals_from: None are tried before this many scans: maps of few scans are full of fragments.
     """
 
@@ -37,6 +38,7 @@ class IntermediateOptions:
     kind_search_growth: int = 4
     proposals: int = 6
     proposals_from: int = 40
+    recent_scans: int = 20
 
 
 INTERMEDIATE = IntermediateOptions()
@@ -86,6 +88,42 @@ class ScanSubset:
         return [piece for scan in self._scans for piece in scan]
 
 
+class RecentScans:
+    """The scans since the last look, and of the looks before as far as these are too few.
+
+    Args:
+        min_scans: How many are enough.
+    """
+
+    def __init__(self, min_scans: int) -> None:
+        self._min_scans = min_scans
+        self._looks: deque[list[tuple[Scan, Pose2D]]] = deque([[]])
+
+    def add(self, scan: Scan, pose: Pose2D) -> None:
+        """Add a scan or a piece of one.
+
+        Args:
+            scan: The scan or piece.
+            pose: The laser's pose.
+        """
+        self._looks[-1].append((scan, pose))
+
+    def pieces(self) -> list[tuple[Scan, Pose2D]]:
+        """Return the pieces of the recent scans; earlier ones are forgotten."""
+        while len(self._looks) > 1 and self._count(1) >= self._min_scans:
+            self._looks.popleft()
+        return [piece for look in self._looks for piece in look]
+
+    def end_look(self) -> None:
+        """Count the scans that come as those of another look."""
+        self.pieces()
+        self._looks.append([])
+
+    def _count(self, first: int) -> int:
+        """Return the number of scans from a look on."""
+        return sum(scan.first_beam == 0 for look in list(self._looks)[first:] for scan, _ in look)
+
+
 class DetectionRefiner:
     """Fits detections to the rays of the scans, from a warm start where it was done before.
 
@@ -93,6 +131,7 @@ class DetectionRefiner:
         noise_std: The range noise (m); None to estimate it.
         frame_covariance: The covariance (3, 3; m, rad) of the map frame's own pose, which adds to that of each
             primitive; None where it is exact.
+        moved: Refines what moves by the scans since it did; None: all is taken to stand.
         options: How much work goes into detection before the last scan.
     """
 
@@ -100,14 +139,28 @@ class DetectionRefiner:
         self,
         noise_std: float | None,
         frame_covariance: FloatArray | None,
+        moved: MovedPrimitives | None = None,
         options: IntermediateOptions = INTERMEDIATE,
     ) -> None:
-        self.scans = ScanSubset(options.scans)
+        self._scans = ScanSubset(options.scans)
+        self._recent = RecentScans(options.recent_scans)
+        self._moved = moved
         self._options = options
         self._noise_std = noise_std
         self._frame_covariance = frame_covariance
         self._previous: tuple[Detections, float | None] | None = None
         self._kind_search_at = 0
+
+    def add(self, scan: Scan, pose: Pose2D) -> None:
+        """Add a scan, or a piece of one, for detections before the last scan.
+
+        Args:
+            scan: The scan or piece.
+            pose: The laser's pose.
+        """
+        self._scans.add(scan, pose)
+        if self._moved is not None:
+            self._recent.add(scan, pose)
 
     def refine_so_far(self, detections: Detections, grid: OccupancyGrid) -> tuple[Detections, float | None]:
         """Refine detections before the last scan, with the rays of a subset of the scans.
@@ -124,32 +177,56 @@ class DetectionRefiner:
         """
         from detect.refinement.refine import Effort, WarmStart
 
-        search_kinds = self.scans.total >= self._options.kind_search_growth * self._kind_search_at
+        search_kinds = self._scans.total >= self._options.kind_search_growth * self._kind_search_at
         if search_kinds:
-            self._kind_search_at = self.scans.total
-        proposals = self._options.proposals if self.scans.total >= self._options.proposals_from else 0
+            self._kind_search_at = self._scans.total
+        proposals = self._options.proposals if self._scans.total >= self._options.proposals_from else 0
         warm_start = None if search_kinds or self._previous is None else WarmStart(*self._previous)
         effort = Effort(warm_start, proposals, rounds=0)
-        self._previous = self._refine(detections, grid, self.scans.pieces(), effort)
-        return self._with_frame_uncertainty(self._previous[0]), self._previous[1]
+        self._previous = self._refine(detections, grid, self._scans.pieces(), effort)
+        refined, noise_std = self._previous
+        stands = WarmStart(refined, noise_std)
+        refined = self._correct(refined, grid, noise_std, self._scans.pieces, Effort(stands, rounds=0))
+        self._recent.end_look()
+        return self._with_frame_uncertainty(refined), noise_std
 
     def refine(
-        self, detections: Detections, grid: OccupancyGrid, scans: Iterable[tuple[Scan, Pose2D]]
+        self,
+        detections: Detections,
+        grid: OccupancyGrid,
+        scans: Callable[[], Iterable[tuple[Scan, Pose2D]]],
     ) -> tuple[Detections, float | None]:
         """Refine detections with the rays of all scans.
 
         Args:
             detections: What the networks found.
             grid: The map that they found it in.
-            scans: The pieces of all scans, with the laser's poses.
+            scans: Returns the pieces of all scans, with the laser's poses, each time anew.
 
         Returns:
             The refined detections and the range noise (m), None where no ray passes any of them.
         """
         from detect.refinement.refine import THOROUGH
 
-        refined, noise_std = self._refine(detections, grid, scans, THOROUGH)
+        refined, noise_std = self._refine(detections, grid, scans(), THOROUGH)
+        refined = self._correct(refined, grid, noise_std, scans, THOROUGH)
         return self._with_frame_uncertainty(refined), noise_std
+
+    def _correct(
+        self,
+        detections: Detections,
+        grid: OccupancyGrid,
+        noise_std: float | None,
+        scans: Callable[[], Iterable[tuple[Scan, Pose2D]]],
+        effort: Effort,
+    ) -> Detections:
+        """Refine by the scans since what the recent ones say has moved."""
+        recent = self._recent.pieces()
+        if self._moved is None or noise_std is None or not recent:
+            return detections
+        from replay.moved_primitives import Look
+
+        return self._moved.correct(Look(detections, grid, noise_std, recent, self._scans.pieces()), scans, effort)
 
     def _refine(
         self, detections: Detections, grid: OccupancyGrid, scans: Iterable[tuple[Scan, Pose2D]], effort: Effort
@@ -164,32 +241,29 @@ class DetectionRefiner:
         if self._frame_covariance is None:
             return detections
         found = tuple(
-            detection
-            if detection.std is None
-            else replace(
-                detection, std=add_frame_uncertainty(detection.primitive, detection.std, self._frame_covariance)
-            )
+            add_frame_uncertainty(detection, self._frame_covariance) if detection.std else detection
             for detection in detections.found
         )
         return replace(detections, found=found)
 
 
-def add_frame_uncertainty(
-    primitive: Primitive, std: Mapping[str, float], frame_covariance: FloatArray
-) -> dict[str, float]:
-    """Add the uncertainty of the map frame's own pose to a primitive's.
+def add_frame_uncertainty(detection: Detection, frame_covariance: FloatArray) -> Detection:
+    """Add the uncertainty of the map frame's own pose to a refined primitive's.
 
     Both errors are taken as independent (see :func:`prim.se2.frame_covariances`).
 
     Args:
-        primitive: The primitive.
-        std: Standard deviations of its parameters in the map frame, by name (m, rad).
+        detection: The refined primitive.
         frame_covariance: The covariance (3, 3; m, rad) of the frame's pose.
 
     Returns:
-        The standard deviations with both added in quadrature, by name (m, rad).
+        The detection with the sum of both covariances.
     """
-    position = np.array([[primitive.x, primitive.y, 0.0]])
-    variances = np.diag(frame_covariances(frame_covariance, position)[0]).tolist()
-    added = dict(zip(("x", "y", "theta"), variances, strict=True))
-    return {name: math.sqrt(value**2 + added.get(name, 0.0)) for name, value in std.items()}
+    assert detection.covariance is not None
+    primitive = detection.primitive
+    added = frame_covariances(frame_covariance, np.array([[primitive.x, primitive.y, 0.0]]))[0]
+    pose = [0, 1, 2][: 2 + (primitive.theta is not None)]
+    covariance = detection.covariance.copy()
+    covariance[np.ix_(pose, pose)] += added[np.ix_(pose, pose)]
+    std = dict(zip(primitive.kind.parameters, np.sqrt(np.diag(covariance)).tolist(), strict=True))
+    return replace(detection, std=std, covariance=covariance)

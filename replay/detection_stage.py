@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -16,8 +16,10 @@ from mapping.mapper import Mapper, make_mapper
 from prim.choices import MapperName
 from prim.errors import UsageError
 from prim.metrics import DetectionErrors, detection_errors
-from prim.scan import PosedScan
+from prim.scan import PosedScan, Scan
+from prim.se2 import Pose2D
 from prim.shapes import Primitive
+from prim.threads import preload
 from replay.detection_refiner import DetectionRefiner
 from replay.ground_truth import GroundTruth
 from replay.intervals import detection_interval, is_due
@@ -29,6 +31,7 @@ if TYPE_CHECKING:
     from detect.detection import Detections
     from detect.detector import Detector
     from detect.tracker import Tracker
+    from replay.moved_primitives import MovedPrimitives
 
 
 @dataclass(frozen=True)
@@ -101,11 +104,17 @@ class DetectionStage:
         cells = math.prod(GridFrame.covering(frame.bounds, detector.card.resolution).shape)
         interval = detection_interval(options, len(posed_scans.scan_log), cells, is_shown)
         self._interval, self.note = interval.scans, interval.note
-        frame_covariance = posed_scans.poses.frame_covariance
-        self._refiner = DetectionRefiner(options.noise_std, frame_covariance) if options.refine else None
-        self._tracker = _tracker() if self._interval else None
+        self._refiner = self._make_refiner(options, frame) if options.refine else None
+        self._tracker = preload(_tracker) if self.streaming else None
         self._truth = truth
         self._timer = timer
+
+    def _make_refiner(self, options: ReplayOptions, frame: GridFrame) -> DetectionRefiner:
+        """Make what refines; it finds what moved where there are looks along the way and poses do not drift."""
+        poses, moved = self._posed_scans.poses, None
+        if self.streaming and poses.max_std is not None:
+            moved = _moved_primitives(self._detector, options, frame, poses.max_std)
+        return DetectionRefiner(options.noise_std, poses.frame_covariance, moved)
 
     @property
     def streaming(self) -> bool:
@@ -153,34 +162,33 @@ class DetectionStage:
             detections = self._detector.detect(grid)
         noise_std = None
         if self._refiner:
-            pieces = (piece for posed in self._posed_scans for piece in posed.pieces)
             with self._timer.stage("refine"):
-                detections, noise_std = self._refiner.refine(detections, grid, pieces)
+                detections, noise_std = self._refiner.refine(detections, grid, lambda: _pieces(self._posed_scans))
         return self._result(detections, int(self._posed_scans.scan_log.stamps[-1]), noise_std)
 
     def _add(self, posed: PosedScan) -> None:
         """Add a scan to the detector's own map, and to those that refine detections before the last scan."""
         for scan, pose in posed.pieces:
             if self._refiner and self.streaming:
-                self._refiner.scans.add(scan, pose)
+                self._refiner.add(scan, pose)
             if self._own_mapper is not None:
                 (self._own_mapper.update if self.streaming else self._own_mapper.accumulate)(scan, pose)
 
     def _result(self, detections: Detections, stamp: int, noise_std: float | None) -> DetectionResult:
         """Identify the detections' tracks, and evaluate them against the truth at ``stamp`` (ns)."""
         with self._timer.stage("detect"):
-            identities = self._identities(detections)
+            identities = self._identities(detections, stamp)
             if self._truth is None:
                 return DetectionResult(detections, identities, noise_std)
             truth = tuple(self._truth.at(stamp).primitives)
             errors = detection_errors([detection.primitive for detection in detections.found], truth)
             return DetectionResult(detections, identities, noise_std, truth, errors)
 
-    def _identities(self, detections: Detections) -> tuple[TrackIdentity, ...]:
+    def _identities(self, detections: Detections, stamp: int) -> tuple[TrackIdentity, ...]:
         """Return the track of each detection; without a tracker, number them in their order."""
         if self._tracker is None:
             return tuple(TrackIdentity(number) for number in range(1, len(detections.found) + 1))
-        tracks = self._tracker.update(detections.found)
+        tracks = self._tracker.result().update(detections.found, stamp)
         return tuple(TrackIdentity(track.id, track.confirmed, track.std) for track in tracks)
 
 
@@ -254,9 +262,28 @@ def _load(weights: Path, mapper: str, timer: StageTimer) -> Detector:
 
 
 def _tracker() -> Tracker:
-    from detect.tracker import Tracker
+    from detect.tracker import Tracker  # in a thread: it imports filterpy, which takes some tenths of a second
 
     return Tracker()
+
+
+def _moved_primitives(
+    detector: Detector, options: ReplayOptions, frame: GridFrame, pose_std: tuple[float, float]
+) -> MovedPrimitives:
+    """Make the part that refines what moves, with maps as the networks were trained on."""
+    from replay.moved_primitives import MovedPrimitives  # as all that refinement needs
+
+    def make_map(scans: Iterable[tuple[Scan, Pose2D]]) -> OccupancyGrid:
+        mapper = _detectors_mapper(detector, options, frame)
+        for scan, pose in scans:
+            mapper.accumulate(scan, pose)
+        return mapper.finish()
+
+    return MovedPrimitives(make_map, detector.detect, pose_std)
+
+
+def _pieces(posed_scans: PosedScans) -> Iterator[tuple[Scan, Pose2D]]:
+    return (piece for posed in posed_scans for piece in posed.pieces)
 
 
 def _own_mapper(detector: Detector, options: ReplayOptions, frame: GridFrame) -> Mapper | None:
@@ -264,5 +291,11 @@ def _own_mapper(detector: Detector, options: ReplayOptions, frame: GridFrame) ->
     cell = detector.card.resolution
     if np.isclose(options.resolution, cell, rtol=1e-6) and options.sensor_model == "eq4":
         return None
+    return _detectors_mapper(detector, options, frame)
+
+
+def _detectors_mapper(detector: Detector, options: ReplayOptions, frame: GridFrame) -> Mapper:
+    """Make a mapper of the kind and the cells that the detector was trained on."""
+    cell = detector.card.resolution
     noise_std = options.noise_std if options.mapper == MapperName.FORWARD else None
     return make_mapper(options.mapper, cell, GridFrame.covering(frame.bounds, cell).bounds, "eq4", noise_std)

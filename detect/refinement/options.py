@@ -304,6 +304,19 @@ class AcceptanceOptions:
 
 
 @dataclass(frozen=True)
+class StandingOptions:
+    """When the rays of some scans contradict a fit to those of others."""
+
+    min_nats_against: float = 25.0
+    """nats; it is gone where the rays are likelier by more without it: AcceptanceOptions.min_log_ratio."""
+    min_gain: float = 60.0
+    """nats; it was moved where the rays are likelier by more with it elsewhere …"""
+    min_displacement: float = 0.006
+    """m; … by more than this. Of things that stand the gain is up to some 200 nats, by less than 3 mm, or the
+    displacement up to 30 mm, by less than 20 nats (driven sessions, range noise of 50 mm)."""
+
+
+@dataclass(frozen=True)
 class RefinementOptions:
     """All numbers of refinement."""
 
@@ -316,6 +329,7 @@ class RefinementOptions:
     walls: WallOptions = field(default_factory=WallOptions)
     proposals: ProposalOptions = field(default_factory=ProposalOptions)
     acceptance: AcceptanceOptions = field(default_factory=AcceptanceOptions)
+    standing: StandingOptions = field(default_factory=StandingOptions)
     rounds: int = 2
     """Joint fits of all candidates once duplicates are gone."""
     converged: float = 0.002

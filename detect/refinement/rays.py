@@ -21,13 +21,16 @@ from detect.refinement.kernels import (
 )
 from detect.refinement.options import DEFAULTS, RefinementOptions
 from mapping.range_noise import neighbour_noise
-from prim.arrays import FloatArray
+from prim.arrays import FloatArray, Stamps
 from prim.scan import RangeOutcome, Scan
 from prim.se2 import Pose2D
 from prim.shapes import Primitive
 
 FIRST_ROOM = 1024
 """Rays that a buffer has room for at first."""
+
+ALWAYS = np.iinfo(np.int64).min
+"""A stamp (ns) before all scans."""
 
 
 @dataclass(frozen=True)
@@ -136,15 +139,23 @@ class RayBuffer:
 class RayCollector:
     """Collects the rays that pass each of M circles."""
 
-    def __init__(self, centres: FloatArray, reach: FloatArray, options: RefinementOptions = DEFAULTS) -> None:
+    def __init__(
+        self,
+        centres: FloatArray,
+        reach: FloatArray,
+        options: RefinementOptions = DEFAULTS,
+        since: Stamps | None = None,
+    ) -> None:
         """Begin with no rays.
 
         Args:
             centres: (M, 2) in metres, map frame.
             reach: (M,) radii (m).
             options: How many rays at most (``options.rays``), and from how many scans the noise is bounded.
+            since: (M,) stamps (ns); of earlier scans no rays are collected. None: all are.
         """
         self._centres, self._reach, self._options = centres, reach, options
+        self._since = np.full(len(reach), ALWAYS) if since is None else since
         self._buffers = [RayBuffer(options.rays.max_rays) for _ in reach]
         self._scans = 0
         self.span = 0.0
@@ -161,7 +172,7 @@ class RayCollector:
         if len(self._ranges) < self._options.sensor.noise_scans:
             self._ranges.append(scan.ranges)
         away = np.hypot(*(self._centres - (pose.x, pose.y)).T)
-        near = np.flatnonzero(away - self._reach < scan.range_max)
+        near = np.flatnonzero((away - self._reach < scan.range_max) & (self._since <= scan.stamp))
         if not len(near):
             return
         max_range = min(scan.range_max, self._options.rays.max_range)
@@ -211,6 +222,7 @@ def collect_rays(
     primitives: Sequence[Primitive],
     reach: float,
     options: RefinementOptions = DEFAULTS,
+    since: Sequence[int | None] | None = None,
 ) -> tuple[list[RayBundle], float, float]:
     """Collect the rays that come near each primitive.
 
@@ -219,13 +231,15 @@ def collect_rays(
         primitives: The primitives.
         reach: How near (m) to their circumscribed circles.
         options: The limits.
+        since: The stamp (ns) for each from which on scans are used; None for all.
 
     Returns:
         A bundle for each primitive, the largest span of ranges (m), and an upper bound of the noise (m).
     """
     centres = np.array([(primitive.x, primitive.y) for primitive in primitives]).reshape(-1, 2)
     radii = np.array([primitive.bounding_radius + reach for primitive in primitives])
-    collector = RayCollector(centres, radii, options)
+    first = np.array([ALWAYS if stamp is None else stamp for stamp in since or [None] * len(primitives)], np.int64)
+    collector = RayCollector(centres, radii, options, first)
     for scan, pose in scans:
         collector.add(scan, pose)
     return collector.bundles(), collector.span, collector.max_noise

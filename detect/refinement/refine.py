@@ -20,7 +20,6 @@ from concurrent.futures import Executor, ThreadPoolExecutor
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 
 from detect.detection import Detection, Detections, Rejection
 from detect.refinement.candidates import Candidate, find_backgrounds, fit_candidates
@@ -88,11 +87,14 @@ class Effort:
             the time, and the map is not searched for what the networks missed.
         max_proposals: Components of the map that are proposed; None: as in the options.
         rounds: Joint fits once duplicates are gone; None: as in the options.
+        since: Stamp (ns) from which on scans are used for components of the map; None for all. Detections have their
+            own.
     """
 
     warm_start: WarmStart | None = None
     max_proposals: int | None = None
     rounds: int | None = None
+    since: int | None = None
 
 
 THOROUGH = Effort()
@@ -136,7 +138,7 @@ def refine_detections(
         rounds=effort.rounds,
         options=options,
     )
-    refined = refinement.run(starts, scans, known, preferred=found)
+    refined = refinement.run(starts, scans, known, found, [detection.since for detection in wanted])
     kept: list[Detection] = []
     rejected = []
     for number, (guess, result) in enumerate(zip(wanted, refined, strict=True)):
@@ -147,7 +149,7 @@ def refine_detections(
         if result is None or reason:
             rejected.append(_rejection(guess, result, reason))
         else:
-            kept.append(_detection(result, guess.crop))
+            kept.append(_detection(result, guess))
     judged = {id(rejection) for doubtful, rejection in detections.doubtful if id(doubtful) in undecided}
     rejected += [rejection for rejection in detections.rejected if id(rejection) not in judged]
     kept.sort(key=lambda detection: -detection.score)
@@ -167,7 +169,7 @@ def _candidates_of(
     unsure = [detection for detection in unsure if not cells.hides_centroid(detection.primitive)]
     known = [detection.primitive for detection in (*detections.found, *unsure)]
     proposed = [] if warm_start else propose(cells, known, effort.max_proposals, options.proposals)
-    wanted = [*detections.found, *unsure, *(_without_score(primitive) for primitive in proposed)]
+    wanted = [*detections.found, *unsure, *(_without_score(primitive, effort.since) for primitive in proposed)]
     return wanted, {id(detection) for detection in unsure}
 
 
@@ -193,9 +195,9 @@ def _known_before(wanted: Sequence[Detection], before: Detections, limits: Accep
     return known
 
 
-def _without_score(primitive: Primitive) -> Detection:
+def _without_score(primitive: Primitive, since: int | None) -> Detection:
     """Return a component of the map as a detection: without score, box and crop."""
-    return Detection(primitive, 0.0, (0.0, 0.0, 0.0, 0.0), np.zeros((0, 0), np.uint8))
+    return Detection(primitive, 0.0, (0.0, 0.0, 0.0, 0.0), np.zeros((0, 0), np.uint8), since=since)
 
 
 def rejection_reason(result: RefinedPrimitive | None, limits: AcceptanceOptions = DEFAULTS.acceptance) -> str:
@@ -256,14 +258,23 @@ def proposal_rejection_reason(
 
 
 def _rejection(guess: Detection, result: RefinedPrimitive | None, reason: str) -> Rejection:
-    fitted = None if result is None else _detection(result, guess.crop)
+    fitted = None if result is None else _detection(result, guess)
     return Rejection(guess.primitive.kind, guess.score, guess.primitive.x, guess.primitive.y, reason, fitted)
 
 
-def _detection(result: RefinedPrimitive, crop: NDArray[np.uint8]) -> Detection:
+def _detection(result: RefinedPrimitive, guess: Detection) -> Detection:
     outline = result.primitive.outline()
     (x0, y0), (x1, y1) = outline.min(axis=0).tolist(), outline.max(axis=0).tolist()
-    return Detection(result.primitive, result.score, (x0, y0, x1, y1), crop, result.std, result.kind_probabilities)
+    return Detection(
+        result.primitive,
+        result.score,
+        (x0, y0, x1, y1),
+        guess.crop,
+        result.std,
+        result.kind_probabilities,
+        result.covariance,
+        guess.since,
+    )
 
 
 @dataclass
@@ -292,6 +303,7 @@ class Refinement:
         scans: Iterable[tuple[Scan, Pose2D]],
         known: Mapping[int, Detection] | None = None,
         preferred: int = 0,
+        since: Sequence[int | None] | None = None,
     ) -> list[RefinedPrimitive | None]:
         """Refine primitives beside each other.
 
@@ -301,6 +313,7 @@ class Refinement:
             known: By index, detections whose kind is not asked again.
             preferred: Of duplicates the first so many win against others whose log-likelihood ratio is not larger by
                 ``options.acceptance.preference``.
+            since: For each the stamp (ns) from which on scans are used; None for all.
 
         Returns:
             Each refined, in the order given; None for one that no ray passes, that is the duplicate of another, or
@@ -308,7 +321,7 @@ class Refinement:
         """
         if not primitives:
             return []
-        bundles, span, max_noise = collect_rays(scans, primitives, self.options.rays.reach, self.options)
+        bundles, span, max_noise = collect_rays(scans, primitives, self.options.rays.reach, self.options, since)
         detections = known or {}
         candidates = [
             Candidate(start, bundle, self.cells, detections.get(number), self.options)

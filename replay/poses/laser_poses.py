@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
@@ -20,6 +21,9 @@ FUSED = PoseSourceName.FUSED.value
 
 STILL = "still"
 """The source of poses of a robot that stands still."""
+
+EXACT_SOURCES = (PoseSourceName.TRUTH.value, STILL)
+"""The sources of poses without errors."""
 
 
 @dataclass(frozen=True)
@@ -98,6 +102,14 @@ class LaserPoses:
     fusion: Fusion | None = None
     mounts: FloatArray | None = None
     matched: bool = False
+
+    @property
+    def max_std(self) -> tuple[float, float] | None:
+        """The largest standard deviations of position (m) and heading (rad); None where they are not known."""
+        if self.covariances is None:
+            return (0.0, 0.0) if self.source in EXACT_SOURCES and not self.matched else None
+        x, y, theta = np.diagonal(self.covariances, axis1=1, axis2=2)[self.valid].max(axis=0, initial=0.0).tolist()
+        return math.sqrt(x + y), math.sqrt(theta)
 
     def at(self, position: int) -> Pose2D:
         """Return the pose of the scan at this index, with its covariance where that is known."""

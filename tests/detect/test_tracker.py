@@ -7,7 +7,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from filterpy.kalman import KalmanFilter
 
 from detect.detection import Detection
 from detect.tracker import DEFAULTS, Tracker, TrackerOptions
@@ -15,6 +14,7 @@ from prim.arrays import FloatArray
 from prim.se2 import angle_difference
 from prim.shapes import Kind, Primitive, angle_error
 
+SECOND = 10**9
 CROP = np.zeros((1, 1), np.uint8)
 SHAPES = [
     Primitive(Kind.SQUARE, -0.5, 0.5, 0.01, (0.2,)),
@@ -42,7 +42,7 @@ def test_a_track_is_more_accurate_than_its_detections(shape: Primitive) -> None:
     distances, angles = [], []
     for _ in range(40):
         primitive = perturbed(shape, rng)
-        (track,) = tracker.update(detections(primitive))
+        (track,) = tracker.update(detections(primitive), 0)
         distances.append(math.hypot(primitive.x - shape.x, primitive.y - shape.y))
         angles.append(angle_error(primitive, shape) or 0.0)
     estimate = track.primitive
@@ -54,27 +54,106 @@ def test_a_track_is_more_accurate_than_its_detections(shape: Primitive) -> None:
 
 
 @pytest.mark.parametrize("shape", SHAPES, ids=lambda shape: shape.kind)
-def test_the_filter_agrees_with_filterpys(shape: Primitive) -> None:
-    """For varied scores and standard deviations, with angles unwrapped to the nearest of the state's."""
-    rng, tracker = np.random.default_rng(5), Tracker()
-    other = KalmanFilter(dim_x=len(vector(shape)), dim_z=len(vector(shape)))
-    other.F = other.H = np.eye(other.dim_x)
+def test_the_estimate_of_what_stands_is_the_information_weighted_mean(shape: Primitive) -> None:
+    """In closed form, with full covariances: without process noise, of detections with the score 1."""
+    rng, tracker = np.random.default_rng(5), Tracker(TrackerOptions(process_noise=0.0, max_innovation=math.inf))
+    size = len(shape.kind.parameters)
+    information, weighted = np.zeros((size, size)), np.zeros(size)
     for update in range(12):
-        primitive, score = perturbed(shape, rng), rng.uniform(0.01, 1)
-        std = dict(zip(shape.kind.parameters, rng.uniform(0.001, 0.03, other.dim_x), strict=True))
-        (track,) = tracker.update([Detection(primitive, score, (0, 0, 0, 0), CROP, std)])
-        noise, values = np.diag(np.square(list(std.values())) + DEFAULTS.min_std**2), vector(primitive)
-        if update == 0:
-            other.x, other.P = values[:, None], noise
-            continue
-        if primitive.theta is not None:
-            theta, period = other.x[2, 0], primitive.symmetry
-            values[2] = theta + (0.0 if period is None else angle_difference(values[2], theta, period))
-        other.predict(Q=noise * DEFAULTS.process_noise**2)
-        other.update(values[:, None], R=noise / max(score, DEFAULTS.min_weight))
-    expected = Primitive(shape.kind, *other.x[:2, 0], *split(shape, other.x[2:, 0])).canonical()
+        root = rng.normal(0, 0.01, (size, size))
+        covariance = root @ root.T + 1e-6 * np.eye(size)
+        primitive = moderately_perturbed(shape, rng)
+        (track,) = tracker.update([detection_with(primitive, covariance)], update * SECOND)
+        inverse = np.linalg.inv(covariance + DEFAULTS.min_std**2 * np.eye(size))
+        values = vector(primitive)
+        if shape.theta is not None:
+            values[2] = shape.theta + angle_difference(values[2], shape.theta, shape.symmetry or 2 * math.pi)
+        information, weighted = information + inverse, weighted + inverse @ values
+    mean = np.linalg.solve(information, weighted)
+    expected = Primitive(shape.kind, *mean[:2], *split(shape, mean[2:])).canonical()
     assert vector(track.primitive) == pytest.approx(vector(expected), abs=1e-9)
-    assert list(track.std.values()) == pytest.approx(np.sqrt(np.diag(other.P)), abs=1e-9)
+    assert list(track.std.values()) == pytest.approx(np.sqrt(np.diag(np.linalg.inv(information))), rel=1e-9)
+
+
+def test_what_stands_tends_to_the_steady_state_variance() -> None:
+    """Of one parameter p: p = (p + q) r / (p + q + r), so that p² + q p - q r = 0, with q the process noise."""
+    tracker, covariance = Tracker(), np.diag([4e-6, 9e-6, 1e-6])
+    for update in range(60):
+        (track,) = tracker.update([detection_with(SHAPES[2], covariance)], update * SECOND)
+    r = np.diag(covariance) + DEFAULTS.min_std**2
+    q = DEFAULTS.process_noise**2 * r
+    assert np.square(list(track.std.values())) == pytest.approx((np.sqrt(q**2 + 4 * q * r) - q) / 2, rel=1e-9)
+
+
+@pytest.mark.parametrize("seconds", [0.5, 6.0])
+def test_what_moves_follows_at_once_and_at_constant_velocity(seconds: float) -> None:
+    """From its second place on the estimate is the detection's; its next place is predicted."""
+    tracker, shape, covariance = Tracker(), SHAPES[0], np.diag([1e-6] * 4)
+    step = 0.19 if seconds > 1 else 0.09
+    for update in range(3):
+        tracker.update([detection_with(shape, covariance)], round(update * seconds * SECOND))
+    for update in range(3, 8):
+        shape = replace(shape, x=shape.x + step)
+        (track,) = tracker.update([detection_with(shape, covariance)], round(update * seconds * SECOND))
+        assert (track.id, track.best.moving) == (1, True)
+        assert track.primitive.x == pytest.approx(shape.x, abs=3e-3)
+    ahead = track.best.predicted(round(8 * seconds * SECOND))
+    assert ahead.x == pytest.approx(shape.x + step, abs=0.1 * step) and ahead.y == pytest.approx(shape.y, abs=1e-3)
+
+
+def test_what_was_moved_stands_again_and_gains_by_every_detection() -> None:
+    tracker, covariance = Tracker(), np.diag([1e-6] * 3)
+    places = [0.5, 0.5, 0.5, 0.6, 0.7, 0.7, 0.7, 0.7, 0.7]
+    moving, stds = [], []
+    for update, x in enumerate(places):
+        (track,) = tracker.update([detection_with(replace(SHAPES[2], x=x), covariance)], update * SECOND)
+        moving.append(track.best.moving)
+        stds.append(track.std["x"])
+        assert track.primitive.x == pytest.approx(x, abs=1e-3)
+    assert moving == [False] * 3 + [True] * 2 + [False] * 4
+    assert stds[3] == pytest.approx(math.sqrt(2e-6)) and stds[-1] < 0.7 * stds[3]
+
+
+def test_more_work_on_the_same_scans_is_no_motion() -> None:
+    tracker, covariance = Tracker(), np.diag([1e-6] * 3)
+    for x in (0.5, 0.6):
+        (track,) = tracker.update([detection_with(replace(SHAPES[2], x=x), covariance)], SECOND)
+    assert not track.best.moving and track.primitive.x == pytest.approx(0.6)
+
+
+def test_what_was_pushed_far_keeps_its_id_and_a_neighbour_its_own() -> None:
+    """A square is pushed past a circle: no further than the robot pushes, and it is taken for nothing else."""
+    tracker, circle = Tracker(), Primitive(Kind.CIRCLE, 0.0, 0.15, None, (0.07,))
+    square = Primitive(Kind.SQUARE, -0.4, 0.0, 0.0, (0.15,))
+    for update in range(2):
+        before = tracker.update(detections(square, circle), update * 6 * SECOND)
+    ids = [track.id for track in before]
+    pushed = replace(square, x=0.4)
+    assert [track.id for track in tracker.update(detections(circle, pushed), 12 * SECOND)] == ids[::-1]
+    too_soon = replace(square, x=-0.4)
+    assert tracker.update(detections(too_soon), 13 * SECOND)[0].id not in ids
+    other = Primitive(Kind.SQUARE, 0.9, 0.0, 0.0, (0.25,))
+    assert tracker.update(detections(other), 30 * SECOND)[0].id not in ids
+
+
+def test_a_detection_of_another_kind_moves_the_track() -> None:
+    """The estimate of the best kind follows what was detected as another."""
+    tracker, square = Tracker(), SHAPES[0]
+    for update in range(4):
+        tracker.update(detections(square), update * SECOND)
+    rectangle = Primitive(Kind.RECTANGLE, square.x + 0.08, square.y, 0.0, (0.21, 0.19))
+    (track,) = tracker.update(detections(rectangle), 4 * SECOND)
+    assert track.primitive.kind is Kind.SQUARE and track.primitive.x == pytest.approx(rectangle.x, abs=0.01)
+
+
+def detection_with(primitive: Primitive, covariance: FloatArray) -> Detection:
+    std = dict(zip(primitive.kind.parameters, np.sqrt(np.diag(covariance)).tolist(), strict=True))
+    return Detection(primitive.canonical(), 1.0, (0, 0, 0, 0), CROP, std, covariance=covariance)
+
+
+def moderately_perturbed(shape: Primitive, rng: np.random.Generator) -> Primitive:
+    theta = None if shape.theta is None else shape.theta + rng.normal(0, 0.01)
+    return replace(shape, x=shape.x + rng.normal(0, 0.002), theta=theta).canonical()
 
 
 def vector(shape: Primitive) -> FloatArray:
@@ -88,57 +167,61 @@ def split(shape: Primitive, rest: FloatArray) -> tuple[float | None, tuple[float
 
 def test_ids_persist_in_any_order_of_detections() -> None:
     rng, tracker = np.random.default_rng(0), Tracker()
-    first = {shape.kind: track.id for shape, track in zip(SHAPES, tracker.update(detections(*SHAPES)), strict=True)}
+    first = {
+        shape.kind: track.id for shape, track in zip(SHAPES, tracker.update(detections(*SHAPES), 0), strict=True)
+    }
     for _ in range(10):
         order = rng.permutation(len(SHAPES)).tolist()
         found = detections(*(perturbed(SHAPES[k], rng) for k in order))
-        assert [track.id for track in tracker.update(found)] == [first[SHAPES[k].kind] for k in order]
+        assert [track.id for track in tracker.update(found, 0)] == [first[SHAPES[k].kind] for k in order]
     assert sorted(first.values()) == [1, 2, 3, 4, 5]
 
 
 def test_confirmation_and_deletion() -> None:
     tracker = Tracker()
-    (track,) = tracker.update(detections(SHAPES[0]))
+    (track,) = tracker.update(detections(SHAPES[0]), 0)
     assert not track.confirmed
-    tracker.update([])
+    tracker.update([], 0)
     assert tracker.tracks == []  # a tentative track without a detection
     for _ in range(DEFAULTS.confirm_after):
-        (track,) = tracker.update(detections(SHAPES[0]))
+        (track,) = tracker.update(detections(SHAPES[0]), 0)
     assert track.confirmed and track.id == 2
     for _ in range(DEFAULTS.delete_after - 1):
-        tracker.update([])
-    assert tracker.update(detections(SHAPES[0]))[0].id == 2
+        tracker.update([], 0)
+    assert tracker.update(detections(SHAPES[0]), 0)[0].id == 2
     for _ in range(DEFAULTS.delete_after):
-        tracker.update([])
-    assert tracker.tracks == [] and tracker.update(detections(SHAPES[0]))[0].id == 3
+        tracker.update([], 0)
+    assert tracker.tracks == [] and tracker.update(detections(SHAPES[0]), 0)[0].id == 3
 
 
 def test_close_primitives_keep_their_ids() -> None:
     tracker, rng = Tracker(), np.random.default_rng(5)
     left, right = (Primitive(Kind.CIRCLE, x, 0, None, (0.06,)) for x in (-0.065, 0.065))
-    ids = [track.id for track in tracker.update(detections(left, right))]
+    ids = [track.id for track in tracker.update(detections(left, right), 0)]
     for _ in range(20):
-        assert [track.id for track in tracker.update(detections(perturbed(left, rng), perturbed(right, rng)))] == ids
+        assert [
+            track.id for track in tracker.update(detections(perturbed(left, rng), perturbed(right, rng)), 0)
+        ] == ids
 
 
 def test_the_kind_has_the_largest_sum_of_scores() -> None:
     tracker = Tracker()
     square, rectangle = SHAPES[0], Primitive(Kind.RECTANGLE, -0.5, 0.5, 0.0, (0.21, 0.19))
     for primitive, score in ((square, 0.6), (rectangle, 0.9), (square, 0.6), (square, 0.6)):
-        (track,) = tracker.update(detections(primitive, score=score))
+        (track,) = tracker.update(detections(primitive, score=score), 0)
     assert track.id == 1 and track.primitive.kind is Kind.SQUARE
 
 
 def test_a_moving_primitive_keeps_its_track() -> None:
     tracker, shape = Tracker(), SHAPES[2]
     for k in range(30):
-        (track,) = tracker.update(detections(replace(shape, x=0.01 * k)))
+        (track,) = tracker.update(detections(replace(shape, x=0.01 * k)), 0)
     assert track.id == 1 and track.primitive.x == pytest.approx(0.29, abs=0.05)
 
 
 def test_options_set_confirmation_and_gate() -> None:
     tracker = Tracker(TrackerOptions(confirm_after=1, gate_share=0.0, min_gate=0.01))
-    (track,) = tracker.update(detections(SHAPES[2]))
+    (track,) = tracker.update(detections(SHAPES[2]), 0)
     assert track.confirmed
-    (other,) = tracker.update(detections(replace(SHAPES[2], x=SHAPES[2].x + 0.02)))
+    (other,) = tracker.update(detections(replace(SHAPES[2], x=SHAPES[2].x + 0.02)), 0)
     assert other.id == 2

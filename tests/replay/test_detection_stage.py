@@ -208,8 +208,15 @@ def test_the_gaussian_sensor_model_gives_the_detector_its_own_map(
 
 def test_frame_covariance_adds_to_position_and_angle_uncertainty() -> None:
     primitive = Primitive(Kind.RECTANGLE, 3.0, -4.0, 0.2, (0.3, 0.2))
-    std = {"x": 0.003, "y": 0.0, "theta": 0.0, "width": 0.001, "height": 0.002}
-    shifted = add_frame_uncertainty(primitive, std, np.diag([0.004**2, 0.0, 0.0]))
-    assert shifted == pytest.approx(std | {"x": 0.005})
-    turned = add_frame_uncertainty(primitive, std, np.diag([0.0, 0.0, 0.001**2]))
-    assert turned == pytest.approx(std | {"x": 0.005, "y": 0.003, "theta": 0.001})  # 4 m and 3 m from the origin
+    detection = Detection(
+        primitive, 0.9, (0, 0, 0, 0), np.zeros((1, 1), np.uint8), covariance=np.diag([9e-6, 0, 0, 1e-6, 4e-6])
+    )
+    detection = replace(detection, std={"x": 0.003, "y": 0.0, "theta": 0.0, "width": 0.001, "height": 0.002})
+    shifted = add_frame_uncertainty(detection, np.diag([0.004**2, 0.0, 0.0]))
+    assert shifted.std == pytest.approx({**(detection.std or {}), "x": 0.005})
+    turned = add_frame_uncertainty(detection, np.diag([0.0, 0.0, 0.001**2]))
+    assert turned.std == pytest.approx({**(detection.std or {}), "x": 0.005, "y": 0.003, "theta": 0.001})
+    assert turned.covariance is not None and detection.covariance is not None
+    lever = np.array([4.0, 3.0, 1.0]) * 0.001  # the place and the angle turn together
+    assert turned.covariance[:3, :3] - detection.covariance[:3, :3] == pytest.approx(np.outer(lever, lever))
+    assert np.array_equal(turned.covariance[3:], detection.covariance[3:])

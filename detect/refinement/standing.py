@@ -1,0 +1,121 @@
+"""Whether primitives stand, in some scans, where they were fitted by others.
+
+A fit to the rays of all scans mixes the places of a primitive that moved. Some of the scans alone, the recent ones,
+tell: either their rays are likelier without the primitive anywhere near (it is gone), or with it elsewhere nearby
+(it was moved).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from enum import Enum
+
+import numpy as np
+
+from detect.detection import Detection
+from detect.refinement.candidates import Candidate, find_backgrounds
+from detect.refinement.evidence import exact_costs
+from detect.refinement.fit import refit_same_kind
+from detect.refinement.geometry import parameters_of, primitive_of
+from detect.refinement.kernels import BACKGROUND
+from detect.refinement.map_cells import MapCells
+from detect.refinement.options import DEFAULTS, RefinementOptions, StandingOptions
+from detect.refinement.rays import collect_rays
+from detect.refinement.sensor_model import BeamModel
+from mapping.grid import OccupancyGrid
+from prim.scan import Scan
+from prim.se2 import Pose2D
+from prim.shapes import Primitive, angle_error
+
+
+class Verdict(Enum):
+    """What the rays of some scans say of a primitive's place."""
+
+    STANDS = "stands"
+    MOVED = "moved"
+    GONE = "gone"
+
+
+@dataclass(frozen=True)
+class Judgement:
+    """What the rays of some scans say of a primitive's place.
+
+    Attributes:
+        verdict: Whether it stands there.
+        nearby: The primitive at the likeliest place nearby.
+        log_ratio: Log-likelihood ratio of the rays with the primitive against nothing in its place (nats).
+    """
+
+    verdict: Verdict
+    nearby: Primitive
+    log_ratio: float = 0.0
+
+    @property
+    def is_seen(self) -> bool:
+        """Whether the rays show that it stands, not merely nothing else."""
+        return self.verdict is Verdict.STANDS and self.log_ratio > 0
+
+
+def judge_places(
+    detections: Sequence[Detection],
+    scans: Iterable[tuple[Scan, Pose2D]],
+    grid: OccupancyGrid,
+    noise_std: float,
+    threads: int,
+    slack: float = 0.0,
+    options: RefinementOptions = DEFAULTS,
+) -> list[Judgement]:
+    """Judge whether primitives stand, in some scans, where they were fitted.
+
+    Args:
+        detections: The fitted primitives.
+        scans: The scans, with the laser's poses.
+        grid: The map that shows what is behind the primitives.
+        noise_std: Range noise (m).
+        threads: How many are used.
+        slack: What the poses' errors alone may displace a primitive by (m).
+        options: Numeric parameters.
+
+    Returns:
+        The judgement of each; it stands also where no ray says otherwise.
+    """
+    if not detections:
+        return []
+    cells = MapCells.of(grid, options.map, options.lines)
+    primitives = [detection.primitive for detection in detections]
+    bundles, span, max_noise = collect_rays(scans, primitives, options.rays.fitted_reach, options)
+    candidates = [
+        Candidate(detection.primitive, bundle, cells, detection, options)
+        for detection, bundle in zip(detections, bundles, strict=True)
+    ]
+    sensor = BeamModel.create(noise_std, span or 1.0, max_std=max_noise, options=options.sensor)
+    with ThreadPoolExecutor(threads) as pool:
+        find_backgrounds(pool, candidates, cells, options.map.cleared, options)
+        return list(pool.map(lambda candidate: _judge(candidate, candidates, sensor, slack), candidates))
+
+
+def _judge(candidate: Candidate, candidates: Sequence[Candidate], sensor: BeamModel, slack: float) -> Judgement:
+    """Judge one primitive beside the others."""
+    start = candidate.start
+    if not len(candidate.bundle):
+        return Judgement(Verdict.STANDS, start)
+    limits, kind, p = candidate.options.standing, start.kind, parameters_of(start)
+    bundle = candidate.rays_with_background(candidates, sensor)
+    (fit,) = refit_same_kind(candidate.known_fit, bundle, sensor, candidate.options.fit)
+    here, there = exact_costs(kind, np.stack([p, fit.p]), bundle, sensor, candidate.options.evidence).tolist()
+    nearby, nothing = primitive_of(kind, fit.p), float(-bundle.rays[BACKGROUND].sum())
+    if min(here, there) - nothing > limits.min_nats_against:
+        return Judgement(Verdict.GONE, start, nothing - here)
+    if here - there > limits.min_gain and _is_displaced(start, nearby, slack, limits):
+        return Judgement(Verdict.MOVED, nearby, nothing - here)
+    return Judgement(Verdict.STANDS, start, nothing - here)
+
+
+def _is_displaced(before: Primitive, after: Primitive, slack: float, limits: StandingOptions) -> bool:
+    """Return whether a primitive's outline was displaced, shifted or turned, by more than errors explain."""
+    shift = math.hypot(after.x - before.x, after.y - before.y)
+    turn = angle_error(after, before) or 0.0
+    return max(shift, turn * before.bounding_radius) > max(limits.min_displacement, slack)

@@ -1,0 +1,167 @@
+"""Primitives that move: judged by recent scans, refined by the scans since, with one id; what stands is untouched."""
+
+from __future__ import annotations
+
+import math
+from concurrent.futures import Future
+from dataclasses import replace
+from itertools import pairwise
+
+import numpy as np
+import pytest
+
+from detect.detection import Detection
+from detect.refinement.rays import collect_rays
+from detect.refinement.standing import Verdict, judge_places
+from mapping.mapper import make_mapper
+from prim.scan import Scan
+from prim.se2 import Pose2D
+from prim.shapes import Kind, Primitive
+from prim.threads import preload
+from prim.world import World
+from recorder.sensors import Lidar
+from recorder.session import SessionOptions, record_session
+from recorder.world import WorldOptions
+from replay.detection_refiner import RecentScans
+from replay.detection_stage import DetectionResult
+from replay.options import ReplayOptions
+from replay.pipeline import Pipeline
+from replay.viewing.protocol import NullViewer
+
+BOUNDS = (-1.0, -1.0, 1.0, 1.0)
+SQUARE = Primitive(Kind.SQUARE, 0.3, 0.2, 0.3, (0.2,))
+CIRCLE = Primitive(Kind.CIRCLE, -0.4, 0.3, None, (0.12,))
+NOISE = 0.03
+
+
+def scans_of(*primitives: Primitive, seed: int = 0) -> list[tuple[Scan, Pose2D]]:
+    world, lidar, rng = World(BOUNDS, primitives), Lidar(rays=300, noise_std=NOISE), np.random.default_rng(seed)
+    poses = [Pose2D(0.7 * math.cos(k), -0.4 + 0.3 * math.sin(k), 0.1 * k) for k in range(12)]
+    return [(lidar.measure(world, pose, k, 0.1, rng), pose) for k, pose in enumerate(poses)]
+
+
+def verdicts(found: list[Primitive], scans: list[tuple[Scan, Pose2D]], slack: float = 0.0) -> list[Verdict]:
+    mapper = make_mapper("prob", 0.01, BOUNDS)
+    for scan, pose in scans:
+        mapper.update(scan, pose)
+    box, crop = (0.0, 0.0, 0.0, 0.0), np.zeros((1, 1), np.uint8)
+    detections = [Detection(primitive, 1.0, box, crop) for primitive in found]
+    return [judgement.verdict for judgement in judge_places(detections, scans, mapper.grid(), NOISE, 2, slack)]
+
+
+def test_what_stands_is_told_from_what_was_moved_and_what_is_gone() -> None:
+    scans = scans_of(SQUARE, CIRCLE)
+    assert verdicts([SQUARE, CIRCLE], scans) == [Verdict.STANDS] * 2
+    assert verdicts([replace(SQUARE, x=SQUARE.x + 0.03), CIRCLE], scans) == [Verdict.MOVED, Verdict.STANDS]
+    turned = replace(SQUARE, theta=0.6)
+    assert verdicts([turned], scans) == [Verdict.MOVED]
+    away = replace(CIRCLE, x=0.0, y=-0.1)
+    assert verdicts([SQUARE, away], scans) == [Verdict.STANDS, Verdict.GONE]
+
+
+def test_each_primitive_has_the_rays_of_the_scans_since_its_own_stamp() -> None:
+    scans = scans_of(SQUARE, CIRCLE)
+    (early, late), _, _ = collect_rays(scans, [SQUARE, CIRCLE], 0.03, since=[None, 8])
+    assert set(early.scan.tolist()) == {*range(1, 13)} and set(late.scan.tolist()) == {9, 10, 11, 12}
+
+
+def test_errors_of_poses_are_no_motion() -> None:
+    displaced = replace(SQUARE, x=SQUARE.x + 0.03)
+    assert verdicts([displaced], scans_of(SQUARE), slack=0.05) == [Verdict.STANDS]
+
+
+def test_recent_scans_are_those_since_the_last_look_and_enough() -> None:
+    recent, (scan, pose) = RecentScans(3), scans_of(SQUARE)[0]
+
+    def add(*stamps: int) -> None:
+        for stamp in stamps:
+            recent.add(replace(scan, stamp=stamp), pose)
+
+    def stamps() -> list[int]:
+        return [piece.stamp for piece, _ in recent.pieces()]
+
+    add(0, 1, 2, 3)
+    recent.end_look()
+    assert stamps() == [0, 1, 2, 3]
+    add(4, 5)
+    assert stamps() == [0, 1, 2, 3, 4, 5]
+    add(6)
+    assert stamps() == [4, 5, 6]
+
+
+class Collector(NullViewer):
+    """Collects what was detected at each look."""
+
+    def __init__(self) -> None:
+        self.results: list[DetectionResult] = []
+
+    def show_detections(self, position: int, stamp: int, result: DetectionResult) -> None:
+        self.results.append(result)
+
+
+@pytest.fixture(scope="module")
+def looks(tmp_path_factory: pytest.TempPathFactory) -> list[DetectionResult]:
+    """A session of 30 s in which a robot pushes two of four primitives."""
+    path = tmp_path_factory.mktemp("moved") / "moved.mcap"
+    world = WorldOptions(per_kind=(0, 1))
+    record_session(
+        path, SessionOptions(seed=PUSHING_SEED, motion="drive", movable=True, duration=30.0, rate=5.0, world=world)
+    )
+    collector = Collector()
+    Pipeline(path, ReplayOptions(mapper="prob", detect_every=15), collector).run()
+    return collector.results
+
+
+PUSHING_SEED = 8
+PUSHED, STANDING = 2, 0
+"""Of that session a circle that is pushed by 11 cm in the fourth second, and a square that nothing moves."""
+
+
+def nearest(result: DetectionResult, k: int) -> tuple[float, int, Detection]:
+    truth, found = result.truth[k], result.detections.found
+    distances = [math.hypot(one.primitive.x - truth.x, one.primitive.y - truth.y) for one in found]
+    index = int(np.argmin(distances))
+    return distances[index], result.identities[index].id, found[index]
+
+
+def test_the_place_of_a_pushed_primitive_follows_within_two_looks(looks: list[DetectionResult]) -> None:
+    steps = [
+        abs(b.truth[PUSHED].x - a.truth[PUSHED].x) + abs(b.truth[PUSHED].y - a.truth[PUSHED].y)
+        for a, b in pairwise(looks)
+    ]
+    first = max(k for k, step in enumerate(steps) if step > 1e-3) + 1
+    distances = [nearest(result, PUSHED)[0] for result in looks[first + 1 :]]
+    assert max(distances) < 0.04 and np.median(distances) < 0.003
+    ids = [nearest(result, PUSHED)[1] for result in looks[first + 2 :]]
+    assert len(set(ids)) == 1
+
+
+def test_a_pushed_primitive_is_refined_by_the_scans_since(looks: list[DetectionResult]) -> None:
+    distance, _, detection = nearest(looks[-1], PUSHED)
+    assert distance < 0.003 and detection.since is not None and detection.std is not None
+    assert distance < 4 * math.hypot(detection.std["x"], detection.std["y"])
+
+
+def test_what_stands_beside_it_is_refined_by_all_scans(looks: list[DetectionResult]) -> None:
+    for result in looks:
+        distance, identity, detection = nearest(result, STANDING)
+        assert distance < 0.003 and detection.since is None and identity == nearest(looks[0], STANDING)[1]
+
+
+def test_covariances_agree_with_standard_deviations(looks: list[DetectionResult]) -> None:
+    for detection in looks[-1].detections.found:
+        assert detection.covariance is not None and detection.std is not None
+        assert list(detection.std) == list(detection.primitive.kind.parameters)
+        assert np.sqrt(np.diag(detection.covariance)) == pytest.approx(list(detection.std.values()))
+        assert np.allclose(detection.covariance, detection.covariance.T)
+        assert np.linalg.eigvalsh(detection.covariance).min() > 0
+
+
+def test_errors_of_a_preload_surface_at_its_use() -> None:
+    def fail() -> int:
+        raise ImportError("no such filter")
+
+    future: Future[int] = preload(fail)
+    with pytest.raises(ImportError, match="no such filter"):
+        future.result()
+    assert preload(lambda: 3).result() == 3
