@@ -50,7 +50,7 @@ class DetectionCollector(NullViewer):
     def __init__(self) -> None:
         self.results: list[DetectionResult] = []
 
-    def show_detections(self, position: int, stamp: int, result: DetectionResult) -> None:
+    def show_detections(self, mapper: str, position: int, stamp: int, result: DetectionResult) -> None:
         """See :meth:`.Viewer.show_detections`."""
         self.results.append(result)
 

@@ -60,6 +60,9 @@ class Mapper(Protocol):
         """Return the map of all scans."""
 
 
+MAX_RESOLUTION = 100.0
+"""The largest side of a cell (m); set by hand."""
+
 MAPPERS = tuple(name.value for name in MapperName)
 SENSOR_MODELS = tuple(name.value for name in SensorModelName)
 
@@ -89,6 +92,26 @@ def check_mapper(name: str, sensor_model: str = "eq4", noise_std: float | None =
         raise UsageError(f"--noise-std is {noise_std:g}: it must be above 0")
 
 
+def check_cells(resolution: float, bounds: Bounds | None) -> None:
+    """Check that a map can have cells of a side and bounds.
+
+    Args:
+        resolution: Side of a cell (m).
+        bounds: (x0, y0, x1, y1) (m); None where they are not given.
+
+    Raises:
+        UsageError: Where it cannot.
+    """
+    if not 0 < resolution <= MAX_RESOLUTION:
+        raise UsageError(f"--resolution is {resolution:g}: it must be above 0 and at most {MAX_RESOLUTION:g} m")
+    if bounds is None:
+        return
+    x0, y0, x1, y1 = bounds
+    if not (-math.inf < x0 < x1 < math.inf and -math.inf < y0 < y1 < math.inf):
+        given = " ".join(f"{value:g}" for value in bounds)
+        raise UsageError(f"--bounds is {given}: X0 must be below X1 and Y0 below Y1")
+
+
 def make_mapper(
     name: str,
     resolution: float,
@@ -115,6 +138,7 @@ def make_mapper(
         UsageError: Where the arguments do not fit together.
     """
     check_mapper(name, sensor_model, noise_std)
+    check_cells(resolution, bounds)
     if sensor_model == "gaussian" and noise_std is None:
         raise UsageError("the Gaussian sensor model needs --noise-std")
     make = _FACTORIES[name]

@@ -15,15 +15,13 @@ from prim.lazy import lazy_exports
 
 if TYPE_CHECKING:
     from mapping.grid import GridFrame, OccupancyGrid
-    from mapping.mapper import make_mapper
     from prim.errors import LogReadError, OutputError, PrimError, UsageError, WorldError
-    from prim.log import open_log
     from prim.scan import Scan
     from prim.se2 import Pose2D
     from prim.shapes import Kind, Primitive
     from prim.world import World
     from recorder.api import record
-    from replay.api import LaserTrajectory, Result, posed_scans, refine, replay, replay_each
+    from replay.api import LaserTrajectory, Result, make_mapper, open_log, posed_scans, refine, replay, replay_each
     from replay.found_primitives import FoundPrimitive
     from replay.picture import Picture
 
@@ -74,8 +72,8 @@ _, __getattr__, __dir__ = lazy_exports(
         "UsageError": "prim.errors",
         "World": "prim.world",
         "WorldError": "prim.errors",
-        "make_mapper": "mapping.mapper",
-        "open_log": "prim.log",
+        "make_mapper": "replay.api",
+        "open_log": "replay.api",
         "posed_scans": "replay.api",
         "record": "recorder.api",
         "refine": "replay.api",

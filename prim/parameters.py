@@ -1,14 +1,104 @@
-"""Texts that name options of the command line, for users of the API: ``--n-scans`` is their ``n_scans``."""
+"""Parameters of the API: their values checked, and messages that name them: ``--n-scans`` is ``n_scans`` there."""
 
 from __future__ import annotations
 
+import difflib
 import re
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterator, Mapping
 from contextlib import contextmanager
+from functools import lru_cache
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, get_type_hints
 
-from prim.errors import LogReadError, PrimError
+from prim.errors import LogReadError, PrimError, UsageError
+
+if TYPE_CHECKING:
+    from pydantic import BaseModel
 
 _FLAG = re.compile(r"--([a-z][a-z0-9-]*)")
+
+_ANGLES = {" X Y DEG": " (x, y, radians)"}
+"""What stands behind an option of the command line, and behind the parameter."""
+
+
+def checked_path(name: str, value: object) -> Path:
+    """Return a path that was given as text or as a path, ``~`` expanded.
+
+    Args:
+        name: The parameter's name.
+        value: Its value.
+
+    Returns:
+        The path.
+
+    Raises:
+        UsageError: It is neither.
+    """
+    if not isinstance(value, str | Path) or not str(value):
+        raise UsageError(f"{name} is {value!r}: give a path, as text or as a Path")
+    return Path(value).expanduser()
+
+
+def checked_keywords(keywords: type, given: Mapping[str, Any], others: Collection[str] = ()) -> dict[str, Any]:
+    """Check keyword arguments against the types of a TypedDict; numbers and switches may be text, as pydantic allows.
+
+    Args:
+        keywords: The TypedDict.
+        given: The arguments.
+        others: Further parameters of the function, which an unknown keyword may have meant.
+
+    Returns:
+        The arguments, converted to their types.
+
+    Raises:
+        UsageError: A keyword does not exist, or a value has another type.
+    """
+    from pydantic import ValidationError
+
+    names = [*keywords.__annotations__, *others]
+    for name in given:
+        if name not in keywords.__annotations__:
+            raise UsageError(f"there is no parameter {name!r}{_suggestion(name, names)}")
+    values = {name: value.tolist() if hasattr(value, "tolist") else value for name, value in given.items()}
+    model = _model(keywords)
+    try:
+        checked = model(**values)
+    except ValidationError as error:
+        first = error.errors()[0]
+        wrong, reason = str(first["loc"][0]), first["msg"].removeprefix("Value error, ")
+        raise UsageError(f"{wrong} is {given[wrong]!r}: {reason[0].lower()}{reason[1:]}") from None
+    return {name: getattr(checked, name) for name in values}
+
+
+@lru_cache
+def _model(keywords: type) -> type[BaseModel]:
+    """Return a model of a TypedDict, which pydantic checks."""
+    from pydantic import BaseModel, ConfigDict, create_model, field_validator
+
+    class Checked(BaseModel):
+        model_config = ConfigDict(arbitrary_types_allowed=True)
+
+        @field_validator("*", mode="before")
+        @classmethod
+        def no_truth_for_a_number(cls, value: object, info: Any) -> object:
+            if isinstance(value, bool) and bool not in _types(cls.model_fields[info.field_name].annotation):
+                raise ValueError("True and False are no value of it")
+            return value
+
+    fields: dict[str, Any] = {name: (hint, None) for name, hint in get_type_hints(keywords).items()}
+    return create_model(keywords.__name__, __base__=Checked, **fields)
+
+
+def _types(hint: Any) -> tuple[Any, ...]:
+    return (hint, *getattr(hint, "__args__", ()))
+
+
+def _suggestion(name: str, names: Collection[str]) -> str:
+    """Return which parameter an unknown one may have meant; else the list of all."""
+    if name.removeprefix("no_") in names:
+        return f": give {name.removeprefix('no_')}=False"
+    close = difflib.get_close_matches(name, names, 1)
+    return f": did you mean {close[0]}?" if close else f"; there are {', '.join(sorted(names))}"
 
 
 def name_parameters(text: str, parameters: Collection[str], switches: Collection[str]) -> str:
@@ -32,6 +122,8 @@ def name_parameters(text: str, parameters: Collection[str], switches: Collection
             return f"{name.removeprefix('no_')}=False"
         return name if name in parameters else match[0]
 
+    for option, value in _ANGLES.items():
+        text = text.replace(option, value)
     return _FLAG.sub(parameter, text)
 
 

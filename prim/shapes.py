@@ -31,6 +31,7 @@ from typing import Any
 import numpy as np
 
 from prim.arrays import FloatArray
+from prim.errors import UsageError
 from prim.raycast import cast_ellipses, cast_segments
 from prim.se2 import angle_difference
 
@@ -249,6 +250,8 @@ class Primitive:
     size: tuple[float, ...]
 
     def __post_init__(self) -> None:
+        if not isinstance(self.kind, Kind):
+            raise ValueError(f"{self.kind!r} is no Kind: Primitive.of takes its name")
         keys = self.kind.sizes
         if len(self.size) != len(keys):
             raise ValueError(f"a {self.kind} has {len(keys)} sizes ({', '.join(keys)}), not {len(self.size)}")
@@ -275,9 +278,17 @@ class Primitive:
             The primitive.
 
         Raises:
-            ValueError: There is no such kind, or the values do not fit it.
+            UsageError: There is no such kind, or the values do not fit it.
         """
-        return cls.from_json({"kind": kind, "x": x, "y": y, "theta": theta, "size": sizes})
+        if kind not in [*Kind]:
+            raise UsageError(f"there is no kind {kind!r}: the kinds are {', '.join(Kind)}")
+        named = Kind(kind)
+        if set(sizes) != set(named.sizes):
+            raise UsageError(f"a {named} has the sizes {', '.join(named.sizes)}, not {', '.join(sizes) or 'none'}")
+        try:
+            return cls(named, x, y, theta, tuple(sizes[name] for name in named.sizes))
+        except (ValueError, TypeError) as error:
+            raise UsageError(str(error)) from None
 
     @property
     def sizes(self) -> dict[str, float]:

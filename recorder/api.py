@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Unpack
 
-from prim.parameters import errors_name_parameters
+from prim.parameters import checked_keywords, checked_path, errors_name_parameters
 from recorder.keywords import PARAMETERS, SWITCHES, RecordingKeywords, recording_options
 from recorder.session import Session, record_session
 
@@ -27,4 +27,5 @@ def record(path: str | Path, **options: Unpack[RecordingKeywords]) -> Session:
         OutputError: The log cannot be written.
     """
     with errors_name_parameters(PARAMETERS, SWITCHES):
-        return record_session(Path(path), recording_options(**options))
+        output = checked_path("path", path)
+        return record_session(output, recording_options(**checked_keywords(RecordingKeywords, options)))

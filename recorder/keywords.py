@@ -93,11 +93,8 @@ def recording_options(**keywords: Unpack[RecordingKeywords]) -> SessionOptions:
         The options.
 
     Raises:
-        UsageError: A keyword does not exist, a value is impossible, or two exclude each other.
+        UsageError: A value is impossible, or two exclude each other.
     """
-    unknown = sorted(set(keywords) - PARAMETERS)
-    if unknown:
-        raise UsageError(f"a recording has no parameter {unknown[0]!r}; it has {', '.join(sorted(PARAMETERS))}")
     given: dict[str, Any] = {name: value for name, value in keywords.items() if value is not None}
     _check_combinations(given)
     _check_values(given)
@@ -161,7 +158,8 @@ def _check_scanner(options: SessionOptions) -> None:
     if max(lidar.range_max, *options.world.size) > MAX_LENGTH:
         raise UsageError(f"--range-max and --size must not be above {MAX_LENGTH:.0f} m")
     if lidar.fov > FULL_TURN * (1 + ROUNDING):
-        raise UsageError(f"--fov {math.degrees(lidar.fov):g} degrees is more than a full turn")
+        turn = f"{math.degrees(lidar.fov):g} degrees, {lidar.fov:g} rad"
+        raise UsageError(f"--fov is more than a full turn: {turn}")
 
 
 def _kinds(listed: Sequence[str] | str) -> tuple[Kind, ...]:

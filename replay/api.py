@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+import math
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,21 +12,27 @@ from typing import TYPE_CHECKING, Any, Unpack
 import numpy as np
 from numpy.typing import NDArray
 
+import mapping.mapper
+import prim.log
 from mapping.grid import OccupancyGrid
 from mapping.map_metrics import MapScores
+from mapping.mapper import Mapper
 from prim.arrays import FloatArray, Stamps
-from prim.errors import OutputError
-from prim.log import open_log
-from prim.metrics import DetectionErrors
-from prim.parameters import errors_name_parameters, name_parameters
+from prim.errors import OutputError, UsageError
+from prim.log.source import LogSource
+from prim.metrics import DetectionErrors, overlap_coefficient
+from prim.parameters import checked_keywords, checked_path, errors_name_parameters, name_parameters
 from prim.scan import Scan
 from prim.se2 import Pose2D
 from prim.shapes import Primitive
 from prim.threads import cores
-from replay.exports import log_stem, write_map, write_report, write_trajectory
+from prim.world import Bounds
+from replay.exports import check_distinct, log_stem, write_map, write_report, write_trajectory
 from replay.found_primitives import FoundPrimitive, by_name, found_primitives
 from replay.keywords import PARAMETERS, SWITCHES, ReplayKeywords, replay_options
 from replay.localization import localize, pose_scans
+from replay.notes import pluralize
+from replay.options import ReplayOptions
 from replay.pipeline import Pipeline
 from replay.posed_scans import ScanLog
 from replay.report import report_json
@@ -58,7 +65,7 @@ class LaserTrajectory:
     matched: bool
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Result:
     """What a replay of a log found out by one mapper.
 
@@ -67,6 +74,7 @@ class Result:
         grid: The map: ``grid.probability`` (rows, cols), 0.5 where unknown, row 0 at the smallest y; ``grid.frame``
             says where it lies.
         poses: Where the laser was.
+        truth: The true primitives at the end; empty where the log has no truth.
         errors: How the primitives compare with the truth (``f1``, ``position`` in m …); None where the log has none.
         scores: How the map compares with the truth; None where the log has none.
         notes: What a user should know.
@@ -76,11 +84,18 @@ class Result:
     primitives: tuple[FoundPrimitive, ...]
     grid: OccupancyGrid
     poses: LaserTrajectory
+    truth: tuple[Primitive, ...]
     errors: DetectionErrors | None
     scores: MapScores | None
     notes: tuple[str, ...]
     report: dict[str, Any]
     _replayed: ReplayResult
+
+    def __repr__(self) -> str:
+        rows, cols = self.grid.frame.shape
+        found, scans = pluralize(len(self.primitives), "primitive"), pluralize(len(self.poses.stamps), "scan")
+        mapper, source = self._replayed.options.mapper, self.poses.source
+        return f"Result({found} in {cols} x {rows} cells of {mapper}, {scans}, poses: {source})"
 
     def table(self) -> pa.Table:
         """Return the primitives as a table, a row for each; see :func:`replay.tables.primitives_table`."""
@@ -92,8 +107,7 @@ class Result:
         """Draw the map, the primitives, and in grey the true ones, where they are known."""
         from replay.picture import draw_picture
 
-        detections = self._replayed.detections
-        return draw_picture(self.grid, self.primitives, detections.truth if detections else ())
+        return draw_picture(self.grid, self.primitives, self.truth)
 
     def save(self, directory: str | Path) -> list[Path]:
         """Write the report, the map for nav2, the poses in TUM's format and the picture into a folder.
@@ -107,7 +121,7 @@ class Result:
         Raises:
             OutputError: A file cannot be written.
         """
-        folder = Path(directory)
+        folder = checked_path("directory", directory)
         try:
             folder.mkdir(parents=True, exist_ok=True)
         except OSError as error:
@@ -122,12 +136,19 @@ class Result:
         return files
 
 
-def replay(log: str | Path, *, save: str | Path | None = None, **options: Unpack[ReplayKeywords]) -> Result:
+def replay(
+    log: str | Path,
+    *,
+    save: str | Path | None = None,
+    progress: Callable[[int, int], None] | None = None,
+    **options: Unpack[ReplayKeywords],
+) -> Result:
     """Replay a log through a mapper and the detector.
 
     Args:
         log: An MCAP log, or the folder of a ROS 2 bag.
         save: Where rerun's recording is saved; None for no recording.
+        progress: Called after each scan with the number of scans so far and in all.
         **options: The options of ``prim-replay``, see :class:`replay.keywords.ReplayKeywords`; angles are radians.
 
     Returns:
@@ -139,17 +160,22 @@ def replay(log: str | Path, *, save: str | Path | None = None, **options: Unpack
         OutputError: The recording cannot be written.
     """
     with _errors():
-        return _as_result(Pipeline(Path(log), replay_options(**options), _viewer(save)).run())
+        return _as_result(_pipeline(log, save, progress, options).run())
 
 
 def replay_each(
-    log: str | Path, *, save: str | Path | None = None, **options: Unpack[ReplayKeywords]
+    log: str | Path,
+    *,
+    save: str | Path | None = None,
+    progress: Callable[[int, int], None] | None = None,
+    **options: Unpack[ReplayKeywords],
 ) -> dict[str, Result]:
-    """Replay a log through several mappers side by side: ``mapper="det,prob,forward"``.
+    """Replay a log through several mappers side by side: ``mapper=["det", "prob", "forward"]``.
 
     Args:
         log: An MCAP log, or the folder of a ROS 2 bag.
         save: Where rerun's recording of all of them is saved; None for no recording.
+        progress: Called after each scan with the number of scans so far and in all.
         **options: As for :func:`replay`.
 
     Returns:
@@ -161,7 +187,7 @@ def replay_each(
         OutputError: The recording cannot be written.
     """
     with _errors():
-        results = Pipeline(Path(log), replay_options(**options), _viewer(save)).run_each()
+        results = _pipeline(log, save, progress, options).run_each()
         return {result.options.mapper: _as_result(result) for result in results}
 
 
@@ -174,20 +200,73 @@ def posed_scans(log: str | Path, **options: Unpack[ReplayKeywords]) -> Iterator[
         log: An MCAP log, or the folder of a ROS 2 bag.
         **options: As for :func:`replay`; those of the mapper and the detector have no effect.
 
-    Yields:
-        A scan or piece of one, and the laser's pose in the map frame, with its covariance where that is known.
+    Returns:
+        Yields a scan or piece of one, and the laser's pose in the map frame, with its covariance where that is known.
 
     Raises:
         UsageError: A parameter is impossible, or two exclude each other.
-        LogReadError: The log cannot be read, or has no poses.
+        LogReadError: The log cannot be read, or has no poses; when the first scan is asked for.
     """
     with _errors():
-        chosen, timer = replay_options(**options), StageTimer()
-        with open_log(log, recover=chosen.recover) as source:
-            scans = ScanLog(source, chosen.scan_topic, chosen.selection)
-            poses = localize(source, scans, chosen, timer).poses
-            for posed in pose_scans(scans, poses, chosen, timer):
-                yield from posed.pieces
+        path = checked_path("log", log)
+        chosen = replay_options(**checked_keywords(ReplayKeywords, options))
+    return _posed_scans(path, chosen)
+
+
+def _posed_scans(path: Path, options: ReplayOptions) -> Iterator[tuple[Scan, Pose2D]]:
+    timer = StageTimer()
+    with _errors(), prim.log.open_log(path, recover=options.recover) as source:
+        scans = ScanLog(source, options.scan_topic, options.selection)
+        poses = localize(source, scans, options, timer).poses
+        for posed in pose_scans(scans, poses, options, timer):
+            yield from posed.pieces
+
+
+def open_log(log: str | Path, recover: bool = False) -> LogSource:
+    """Open a log: its topics, messages, metadata and attachments, as :class:`prim.log.source.LogSource` has them.
+
+    Args:
+        log: An MCAP log, or the folder of a ROS 2 bag.
+        recover: Read what is left of a damaged log.
+
+    Returns:
+        The log, to be used as a context manager.
+
+    Raises:
+        LogReadError: The log cannot be read.
+    """
+    with _errors():
+        return prim.log.open_log(checked_path("log", log), recover)
+
+
+def make_mapper(
+    name: str,
+    resolution: float = 0.01,
+    bounds: Bounds | None = None,
+    sensor_model: str = "eq4",
+    noise_std: float | None = None,
+) -> Mapper:
+    """Make a mapper, to be fed scan by scan: ``update(scan, pose)``, then ``grid()`` at any time, ``finish()`` last.
+
+    Args:
+        name: «det», «prob» or «forward».
+        resolution: Side of a cell (m).
+        bounds: (x0, y0, x1, y1) (m) of the map; None: it grows with the scans.
+        sensor_model: The inverse sensor model of «prob»: «eq4» or «gaussian».
+        noise_std: Standard deviation of the range noise (m); ``forward`` estimates it where it is not given.
+
+    Returns:
+        The mapper.
+
+    Raises:
+        UsageError: The arguments do not fit together.
+    """
+    given = {"resolution": resolution, "bounds": bounds, "sensor_model": sensor_model, "noise_std": noise_std}
+    with _errors():
+        checked = checked_keywords(ReplayKeywords, given)
+        return mapping.mapper.make_mapper(
+            name, checked["resolution"], checked["bounds"], checked["sensor_model"], checked["noise_std"]
+        )
 
 
 def refine(
@@ -198,6 +277,8 @@ def refine(
 ) -> list[FoundPrimitive | None]:
     """Fit primitives to the rays of scans by maximum likelihood: guesses of any detector become estimates.
 
+    Of guesses whose outlines overlap the first is fitted, and the others are None: give the best ones first.
+
     Args:
         primitives: The guesses, in the map frame.
         scans: The scans with the laser's poses, as :func:`posed_scans` yields them.
@@ -206,15 +287,24 @@ def refine(
 
     Returns:
         For each guess, in their order, the likeliest primitive with its standard deviations, its id the guess's
-        number from 1 on; None where the rays contradict it.
+        number from 1 on; None where the rays contradict it, or where it overlaps one before it.
+
+    Raises:
+        UsageError: An argument is of another kind, or the noise is not above 0.
     """
     from detect.refinement.map_cells import MapCells
     from detect.refinement.options import DEFAULTS
     from detect.refinement.refine import Refinement, rejection_reason
 
     guesses = [guess.primitive if isinstance(guess, FoundPrimitive) else guess for guess in primitives]
+    _check_refinable(guesses, grid, noise_std)
+    fitted = [
+        k for k, guess in enumerate(guesses) if not _overlaps(guess, guesses[:k], DEFAULTS.acceptance.max_shared)
+    ]
     cells = MapCells.of(grid, DEFAULTS.map, DEFAULTS.lines)
-    fits = Refinement(cells, noise_std, cores()).run(guesses, scans)
+    found = Refinement(cells, noise_std, cores()).run([guesses[k] for k in fitted], _checked_pairs(scans))
+    of_guess = dict(zip(fitted, found, strict=True))
+    fits = [of_guess.get(k) for k in range(len(guesses))]
     return [
         None
         if fit is None or rejection_reason(fit)
@@ -234,17 +324,55 @@ def refine(
     ]
 
 
+def _overlaps(guess: Primitive, others: Iterable[Primitive], limit: float) -> bool:
+    return any(overlap_coefficient(guess, other) > limit for other in others)
+
+
+def _check_refinable(guesses: Iterable[object], grid: object, noise_std: object) -> None:
+    """Raise UsageError where what is to be refined is of another kind."""
+    for guess in guesses:
+        if not isinstance(guess, Primitive):
+            raise UsageError(f"primitives holds {type(guess).__name__}: give prim.Primitive or what a replay found")
+    if not isinstance(grid, OccupancyGrid):
+        raise UsageError(f"grid is {type(grid).__name__}: give a map, such as result.grid")
+    if noise_std is not None and not (isinstance(noise_std, float | int) and 0 < noise_std < math.inf):
+        raise UsageError(f"noise_std is {noise_std!r}: it must be above 0")
+
+
+def _checked_pairs(scans: Iterable[object]) -> Iterator[tuple[Scan, Pose2D]]:
+    """Yield scans with their poses; raise UsageError where there is something else."""
+    for pair in scans:
+        scan, pose = pair if isinstance(pair, tuple) and len(pair) == 2 else (pair, None)
+        if not isinstance(scan, Scan) or not isinstance(pose, Pose2D):
+            raise UsageError("scans holds other things than pairs of a prim.Scan and a prim.Pose2D")
+        yield scan, pose
+
+
 def _errors() -> AbstractContextManager[None]:
     return errors_name_parameters({*PARAMETERS, "save"}, SWITCHES)
 
 
-def _viewer(save: str | Path | None) -> Viewer | None:
+def _pipeline(
+    log: str | Path,
+    save: str | Path | None,
+    progress: Callable[[int, int], None] | None,
+    options: Mapping[str, Any],
+) -> Pipeline:
+    """Make the pipeline of a replay, its arguments checked. Raises UsageError."""
+    path = checked_path("log", log)
+    chosen = replay_options(**checked_keywords(ReplayKeywords, options, ("save", "progress")))
+    recording = None if save is None else checked_path("save", save)
+    check_distinct([path], [recording] if recording else [])
+    return Pipeline(path, chosen, _viewer(recording), progress)
+
+
+def _viewer(save: Path | None) -> Viewer | None:
     """Make the viewer that saves a recording; None where none is wanted."""
     if save is None:
         return None
     from replay.viewer import RerunViewer
 
-    return RerunViewer(ViewerOptions(save=Path(save)), announce=lambda line: None)
+    return RerunViewer(ViewerOptions(save=save), announce=lambda line: None)
 
 
 def _as_result(result: ReplayResult) -> Result:
@@ -256,6 +384,7 @@ def _as_result(result: ReplayResult) -> Result:
         primitives=found_primitives(result.detections),
         grid=result.grid,
         poses=LaserTrajectory(stamps, poses.poses[valid], covariances, poses.source, poses.matched),
+        truth=result.detections.truth if result.detections else (),
         errors=result.detections.errors if result.detections else None,
         scores=result.scores,
         notes=tuple(name_parameters(note, {*PARAMETERS, "save"}, SWITCHES) for note in notes),

@@ -277,9 +277,11 @@ def _replay_logs(
     verbosity: Verbosity,
 ) -> int:
     """Replay logs one after the other; return the exit code of the worst."""
+    from replay.exports import check_distinct
+
     with_recording = viewer is not None and not viewer.watched
     jobs = {log: files.named_after(log, options.mappers, with_recording) for log in logs}
-    _check_distinct(logs, [path for outputs in jobs.values() for path in outputs.paths(options.mappers)])
+    check_distinct(logs, [path for outputs in jobs.values() for path in outputs.paths(options.mappers)])
     codes = []
     for log, outputs in jobs.items():
         shown = None if viewer is None else dataclasses.replace(viewer, save=outputs.recording)
@@ -290,19 +292,6 @@ def _replay_logs(
                 raise
             codes.append(console.print_error("prim-replay", error, verbosity.debug))
     return next((code for code in (console.FAILED, console.USAGE, PARTLY_LOST) if code in codes), 0)
-
-
-def _check_distinct(logs: Sequence[Path], outputs: Sequence[Path]) -> None:
-    """Raise UsageError where a file would be written twice, or over a log."""
-    files = [path.resolve() for path in outputs]
-    inputs = {log.resolve() for log in logs}
-    if len(inputs) < len(logs):
-        raise UsageError("a log is named twice")
-    for path in files:
-        if path in inputs:
-            raise UsageError(f"{path} is a log: it cannot be an output as well")
-        if files.count(path) > 1:
-            raise UsageError(f"{path} would be written twice: name the outputs, or replay the logs one by one")
 
 
 def _replay_log(

@@ -5,14 +5,14 @@ from __future__ import annotations
 import errno
 import json
 import os
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
 
 from mapping.grid import OccupancyGrid
-from prim.errors import OutputError
+from prim.errors import OutputError, UsageError
 from replay.report import report_json
 from replay.result import ReplayResult
 
@@ -32,6 +32,27 @@ def check_writable(path: Path) -> None:
             raise FileNotFoundError(errno.ENOENT, os.strerror(errno.ENOENT))
         if not os.access(path if path.exists() else path.parent, os.W_OK):
             raise PermissionError(errno.EACCES, os.strerror(errno.EACCES))
+
+
+def check_distinct(logs: Sequence[Path], outputs: Sequence[Path]) -> None:
+    """Check that no file would be written twice, or over a log.
+
+    Args:
+        logs: The logs.
+        outputs: The files that would be written.
+
+    Raises:
+        UsageError: One would, or a log is named twice.
+    """
+    files = [path.resolve() for path in outputs]
+    inputs = {log.resolve() for log in logs}
+    if len(inputs) < len(logs):
+        raise UsageError("a log is named twice")
+    for path in files:
+        if path in inputs:
+            raise UsageError(f"{path} is a log: it cannot be an output as well")
+        if files.count(path) > 1:
+            raise UsageError(f"{path} would be written twice: name the outputs, or replay the logs one by one")
 
 
 def write_map(stem: Path, grid: OccupancyGrid) -> None:

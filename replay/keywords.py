@@ -21,7 +21,8 @@ class ReplayKeywords(TypedDict, total=False):
     :class:`replay.selection.Selection` say what each means; the rest is described here.
     """
 
-    mapper: str
+    mapper: str | Sequence[str]
+    """One mapper, or several: a list, or separated by commas."""
     sensor_model: str
     noise_std: float | None
     pose: str
@@ -77,20 +78,17 @@ def replay_options(**keywords: Unpack[ReplayKeywords]) -> ReplayOptions:
         The options.
 
     Raises:
-        UsageError: A keyword does not exist, a value is impossible, or two exclude each other.
+        UsageError: A value is impossible, or two exclude each other.
     """
-    unknown = sorted(set(keywords) - PARAMETERS)
-    if unknown:
-        raise UsageError(f"a replay has no parameter {unknown[0]!r}; it has {', '.join(sorted(PARAMETERS))}")
     given = {name: value for name, value in keywords.items() if value is not None}
     selection = Selection(**{name: given.pop(name) for name in _SELECTION if name in given})  # type: ignore[arg-type]
     fuse = _fusion_inputs(**{name: given.pop(name) for name in _FUSION if name in given})  # type: ignore[arg-type]
+    if "mapper" in given:
+        given["mapper"] = ",".join(_listed(given["mapper"]))  # type: ignore[arg-type]
     if "laser_offset" in given:
         given["laser_offset"] = _as_pose(given["laser_offset"])  # type: ignore[arg-type]
     if "weights" in given:
         given["weights"] = Path(given["weights"])  # type: ignore[arg-type]
-    if "bounds" in given:
-        given["bounds"] = _as_bounds(given["bounds"])  # type: ignore[arg-type]
     return ReplayOptions(selection=selection, fuse=fuse, **given)  # type: ignore[arg-type]
 
 
@@ -102,8 +100,7 @@ def _fusion_inputs(
     odom_noise: tuple[float, float] | None = None,
 ) -> FusionInputs:
     """Return what poses are fused from, and its noise. Raises UsageError."""
-    listed = fuse.split(",") if isinstance(fuse, str) else fuse
-    names = SENSORS if listed is None else tuple(name.strip() for name in listed)
+    names = SENSORS if fuse is None else _listed(fuse)
     unknown = [name for name in names if name not in SENSORS]
     if unknown:
         raise UsageError(
@@ -113,16 +110,10 @@ def _fusion_inputs(
     return FusionInputs(tuple(name for name in SENSORS if name in names), gps_topic, compass_topic, noise)
 
 
+def _listed(names: Sequence[str] | str) -> tuple[str, ...]:
+    """Return names that are given as a list, or separated by commas."""
+    return tuple(name.strip() for name in (names.split(",") if isinstance(names, str) else names))
+
+
 def _as_pose(offset: tuple[float, float, float] | Pose2D) -> Pose2D:
-    if isinstance(offset, Pose2D):
-        return offset
-    if len(offset) != 3:
-        raise UsageError(f"--laser-offset has {len(offset)} values: give x, y and heading")
-    return Pose2D(*offset)
-
-
-def _as_bounds(bounds: Sequence[float]) -> Bounds:
-    if len(bounds) != 4:
-        raise UsageError(f"--bounds has {len(bounds)} values: give x0, y0, x1 and y1")
-    x0, y0, x1, y1 = bounds
-    return x0, y0, x1, y1
+    return offset if isinstance(offset, Pose2D) else Pose2D(*offset)

@@ -9,8 +9,8 @@ from typing import Final, Literal
 
 import numpy as np
 
-from mapping.mapper import check_mapper
-from prim.choices import MapperName, SensorModelName
+from mapping.mapper import check_cells, check_mapper
+from prim.choices import MapperName, PoseSourceName, SensorModelName
 from prim.errors import UsageError
 from prim.se2 import Pose2D
 from prim.world import Bounds
@@ -20,6 +20,9 @@ from replay.selection import Selection
 
 END: Final = "end"
 """The value of ``detect_every`` for one detection, after the last scan."""
+
+MAX_TURN = 2 * math.pi
+"""The largest turn (rad) of a laser on its robot: larger ones are degrees given as radians."""
 
 MAX_OFFSET = 1000.0
 """The largest plausible distance (m) of a laser from its robot's origin; set by hand."""
@@ -84,10 +87,7 @@ class ReplayOptions:
 
     def __post_init__(self) -> None:
         self._check_mappers()
-        if not (0 < self.resolution < np.inf):
-            raise UsageError(f"--resolution is {self.resolution:g}: it must be above 0")
-        if self.bounds is not None and not (self.bounds[0] < self.bounds[2] and self.bounds[1] < self.bounds[3]):
-            raise UsageError("--bounds X0 Y0 X1 Y1: X0 must be below X1 and Y0 below Y1")
+        check_cells(self.resolution, self.bounds)
         if self.rate is not None and not (0 < self.rate < np.inf):
             raise UsageError(f"--rate is {self.rate:g}: it must be above 0")
         if self.max_range is not None and not self.max_range > 0:
@@ -151,9 +151,14 @@ class ReplayOptions:
             raise UsageError("--pose-noise and --odom-noise go with --pose fused or with --match-scans")
         if self.odom_topic and self.pose not in ("auto", "odom", FUSED):
             raise UsageError(f"--odom-topic goes with --pose odom, not with --pose {self.pose}")
+        if self.pose not in [*PoseSourceName]:
+            raise UsageError(f"--pose is {self.pose!r}: choose from {', '.join(PoseSourceName)}")
         offset = self.laser_offset
-        if offset is not None and not (np.abs((offset.x, offset.y, offset.theta)) < MAX_OFFSET).all():
+        if offset is not None and not (np.abs((offset.x, offset.y)) < MAX_OFFSET).all():
             raise UsageError(f"--laser-offset is {offset.x:g} {offset.y:g}: it must be metres on a robot")
+        if offset is not None and not abs(offset.theta) <= MAX_TURN:
+            turn = f"{math.degrees(offset.theta):g} degrees"
+            raise UsageError(f"--laser-offset turns by {turn}: it must be within a full turn")
 
     def _check_noise(self) -> None:
         noise = self.fuse.noise

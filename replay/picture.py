@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 
 from mapping.grid import GridFrame, OccupancyGrid
 from prim.arrays import FloatArray
-from prim.errors import OutputError
+from prim.errors import OutputError, UsageError
+from prim.parameters import checked_path
 from prim.shapes import Primitive
 from replay.found_primitives import FoundPrimitive
 
@@ -29,7 +30,7 @@ SCALE_BAR_SHARE = 0.2
 """The scale bar is no longer than this share of the picture's width."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Picture:
     """A picture; a notebook shows it by itself.
 
@@ -45,11 +46,22 @@ class Picture:
         return cv2.imencode(".png", cv2.cvtColor(self.pixels, cv2.COLOR_RGB2BGR))[1].tobytes()
 
     def save(self, path: str | Path) -> None:
-        """Write the picture as PNG. Raises OutputError where that fails."""
+        """Write the picture as PNG.
+
+        Raises:
+            UsageError: The name does not end in .png.
+            OutputError: The file cannot be written.
+        """
+        if checked_path("path", path).suffix.lower() != ".png":
+            raise UsageError(f"{path}: a picture is saved as PNG: give a name that ends in .png")
         try:
-            Path(path).write_bytes(self.png)
+            checked_path("path", path).write_bytes(self.png)
         except OSError as error:
             raise OutputError(path, error) from error
+
+    def __repr__(self) -> str:
+        rows, cols, _ = self.pixels.shape
+        return f"Picture({cols} x {rows} pixels)"
 
     def _repr_png_(self) -> bytes:
         return self.png

@@ -79,7 +79,7 @@ NUMBERS = {
     ),
     "mathematics": "NORMAL_MAD NORMAL_MEDIAN EQUATORIAL_RADIUS FLATTENING OUTLINE_POINTS",
     "rounding and the infinite": "FAR BEHIND ENDLESS EXACT POSITIVE NO_COUNTS TRANSMITTANCE_FLOOR BORDER_SLACK",
-    "definitions": "UNKNOWN_GREY WHITE_VISITS TOLERANCE_CELLS MAX_CELLS",
+    "definitions": "UNKNOWN_GREY WHITE_VISITS TOLERANCE_CELLS MAX_CELLS MAX_RESOLUTION",
 }
 """The numeric constants that modules of algorithms may have beside their options."""
 

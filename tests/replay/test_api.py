@@ -3,6 +3,7 @@
 import inspect
 import json
 import typing
+from collections.abc import Callable
 from pathlib import Path
 
 import cv2
@@ -64,7 +65,10 @@ def test_the_picture_shows_the_map_and_the_outlines(result: Result, tmp_path: Pa
     read = cv2.cvtColor(cv2.imread(str(tmp_path / "a.png")), cv2.COLOR_BGR2RGB)
     assert np.array_equal(read, picture.pixels) and picture._repr_png_() == (tmp_path / "a.png").read_bytes()
     with pytest.raises(prim.OutputError, match="choose another place"):
-        picture.save(tmp_path)
+        picture.save(tmp_path / "no" / "a.png")
+    with pytest.raises(prim.UsageError, match=r"ends in \.png"):
+        picture.save(tmp_path / "a.jpg")
+    assert repr(picture) == f"Picture({cols} x {rows} pixels)"
 
 
 def test_a_large_map_makes_a_picture_of_bounded_size(noisy_session: Session) -> None:
@@ -107,15 +111,33 @@ def test_several_mappers_give_a_result_each(noisy_session: Session, tmp_path: Pa
     ("options", "message"),
     [
         ({"resolution": 0}, "resolution is 0: it must be above 0"),
+        ({"resolution": 1e9}, r"resolution is 1e\+09: it must be above 0 and at most 100 m"),
+        ({"resolution": "fine"}, "resolution is 'fine': input should be a valid number"),
+        ({"resolution": True}, "resolution is True"),
+        ({"detect_every": True}, "detect_every is True"),
+        ({"n_scans": 1.5}, "n_scans is 1.5: input should be a valid integer"),
+        ({"refine": "perhaps"}, "refine is 'perhaps': input should be a valid boolean"),
+        ({"pose": "Truth"}, "pose is 'Truth': choose from auto, truth"),
+        ({"mapper": "Prob"}, "no mapper 'Prob'"),
+        ({"mapper": 5}, "mapper is 5"),
+        ({"laser_offset": (-0.032, 0, 180)}, "laser_offset turns by 10313.2 degrees: it must be within a full turn"),
+        ({"laser_offset": (0, 0, np.nan)}, "laser_offset turns by nan degrees"),
+        ({"laser_offset": 0.3}, "laser_offset is 0.3"),
+        ({"bounds": "0 0 1 1"}, "bounds is '0 0 1 1'"),
+        ({"bounds": (1, 0, 0, 1)}, "bounds is 1 0 0 1: X0 must be below X1"),
+        ({"weights": 5}, "weights is 5"),
+        ({"no_detect": True}, "no parameter 'no_detect': give detect=False"),
+        ({"sav": "a.rrd"}, "no parameter 'sav': did you mean save?"),
+        ({"verbose": True}, "no parameter 'verbose'; there are"),
         ({"detect": False, "refine": False}, "detect=False excludes detect_every, weights and refine=False"),
         ({"standing_still": True, "pose": "tf"}, "standing_still=True excludes pose and odom_topic"),
-        ({"bounds": (0, 1)}, "bounds has 2 values"),
-        ({"laser_offset": (0, 1)}, "laser_offset has 2 values"),
+        ({"bounds": (0, 1)}, r"bounds is \(0, 1\)"),
+        ({"laser_offset": (0, 1)}, r"laser_offset is \(0, 1\)"),
         ({"fuse": ["sonar"]}, "fuse sonar: sonar is no sensor"),
         ({"n_scans": 0}, "n_scans is 0"),
         ({"mapper": "det,prob"}, "replay_each"),
-        ({"maper": "det"}, "no parameter 'maper'"),
-        ({"detect_every": "often"}, "detect_every is often"),
+        ({"maper": "det"}, "no parameter 'maper': did you mean mapper?"),
+        ({"detect_every": "often"}, "detect_every is 'often'"),
         ({"scan_topic": "/nothing"}, "no LaserScan on /nothing"),
     ],
 )
@@ -123,6 +145,81 @@ def test_errors_name_parameters(noisy_session: Session, options: dict[str, objec
     with pytest.raises(prim.PrimError, match=message) as error:
         prim.replay(noisy_session.path, **options)  # type: ignore[arg-type]
     assert "--" not in str(error.value)
+
+
+@pytest.mark.parametrize(
+    "call",
+    [
+        lambda: prim.replay(None),  # type: ignore[arg-type]
+        lambda: prim.replay(""),
+        lambda: prim.replay(b"log.mcap"),  # type: ignore[arg-type]
+        lambda: prim.record(""),
+        lambda: prim.posed_scans("log.mcap", foo=1),  # type: ignore[call-arg]
+        lambda: prim.make_mapper("prob", -0.02),
+        lambda: prim.make_mapper("prob", 0),
+        lambda: prim.make_mapper("forward", float("nan")),
+        lambda: prim.make_mapper("prob", bounds=(1, 1, 0, 0)),
+        lambda: prim.make_mapper("prob", bounds="auto"),  # type: ignore[arg-type]
+        lambda: prim.make_mapper("magic"),
+        lambda: prim.make_mapper("prob", sensor_model="gaussian"),
+        lambda: prim.Primitive.of("hexagon", 0, 0, side=0.1),
+        lambda: prim.Primitive.of("circle", 0, 0, side=0.1),
+        lambda: prim.Primitive.of("circle", 0, 0, radius=-0.1),
+        lambda: prim.Primitive.of("square", 0, 0, side=0.1),
+    ],
+)
+def test_mistakes_are_expected_errors(call: Callable[[], object], in_tmp: Path) -> None:
+    with pytest.raises(prim.PrimError) as error:
+        call()
+    assert "--" not in str(error.value) and "\n" not in str(error.value)
+    assert not list(Path().iterdir())
+
+
+def test_refinement_says_what_it_cannot_take(result: Result, noisy_session: Session) -> None:
+    scans, guess = list(prim.posed_scans(noisy_session.path)), result.primitives[0]
+    for arguments in (
+        ([guess], scans, result.grid, -1.0),
+        ([guess], scans, result.grid.probability),
+        ([(1, 2)], scans, result.grid),
+        ([guess], [scan for scan, _ in scans], result.grid),
+        ([guess], str(noisy_session.path), result.grid),
+    ):
+        with pytest.raises(prim.UsageError):
+            prim.refine(*arguments)  # type: ignore[arg-type]
+
+
+def test_of_guesses_that_overlap_the_first_is_fitted(quiet_session: Session) -> None:
+    grid, scans = prim.replay(quiet_session.path, detect=False).grid, list(prim.posed_scans(quiet_session.path))
+    true = quiet_session.world.primitives[0]
+    near = prim.Primitive.of(true.kind, true.x + 0.01, true.y, true.theta, **true.sizes)
+    alone, fitted, *others = [*prim.refine([near], scans, grid), *prim.refine([near, near, true], scans, grid)]
+    assert others == [None, None] and alone is not None and alone == fitted
+
+
+def test_a_recording_is_never_saved_over_the_log(noisy_session: Session, tmp_path: Path) -> None:
+    log = tmp_path / "log.mcap"
+    log.write_bytes(noisy_session.path.read_bytes())
+    with pytest.raises(prim.UsageError, match="is a log: it cannot be an output as well"):
+        prim.replay(log, save=tmp_path / "." / "log.mcap")
+    assert log.read_bytes() == noisy_session.path.read_bytes()
+
+
+def test_values_may_be_text_and_numbers_of_numpy(noisy_session: Session) -> None:
+    calls: list[int] = []
+    result = prim.replay(
+        noisy_session.path,
+        resolution="0.05",  # type: ignore[arg-type]
+        n_scans=np.int64(3),  # type: ignore[arg-type]
+        bounds=np.array([-1.0, -1.0, 1.0, 1.0]),  # type: ignore[arg-type]
+        detect=False,
+        progress=lambda done, total: calls.append(done),
+    )
+    assert result.grid.frame.shape == (40, 40) and calls == [1, 2, 3]
+    assert repr(result) == "Result(0 primitives in 40 x 40 cells of prob, 3 scans, poses: truth)"
+
+
+def test_several_mappers_may_be_a_list(noisy_session: Session) -> None:
+    assert list(prim.replay_each(noisy_session.path, mapper=["det", "prob"], detect=False)) == ["det", "prob"]
 
 
 def test_log_errors_keep_their_parts(tmp_path: Path) -> None:
@@ -142,6 +239,12 @@ def test_log_errors_keep_their_parts(tmp_path: Path) -> None:
         ({"size": (0, 1)}, "size is 0: it must be above 0"),
         ({"motion": "fly"}, "motion fly"),
         ({"colour": "red"}, "no parameter 'colour'"),
+        ({"stops": 2}, "stops is 2"),
+        ({"size": "2x2"}, "size is '2x2'"),
+        ({"per_kind": "many"}, "per_kind is 'many'"),
+        ({"rays": 3.5}, "rays is 3.5"),
+        ({"world": {}}, "world is {}"),
+        ({"fov": 360}, "20626.5 degrees, 360 rad"),
     ],
 )
 def test_errors_of_recordings_name_parameters(tmp_path: Path, options: dict[str, object], message: str) -> None:
