@@ -31,8 +31,8 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 import numpy as np
-from filterpy.kalman import KalmanFilter
 
+from detect.kalman import KalmanFilter
 from prim.arrays import FloatArray
 from prim.se2 import angle_difference
 from prim.shapes import Kind, Primitive

@@ -17,6 +17,7 @@ from prim.threads import cores
 
 if TYPE_CHECKING:
     from detect.detection import Detection, Detections
+    from detect.refinement.map_cells import MapCells
     from detect.refinement.refine import Effort
     from replay.moved_primitives import MovedPrimitives
 
@@ -175,6 +176,7 @@ class DetectionRefiner:
         Returns:
             The refined detections and the range noise (m), None where no ray passes any of them.
         """
+        from detect.refinement.map_cells import MapCells
         from detect.refinement.refine import Effort, WarmStart
 
         search_kinds = self._scans.total >= self._options.kind_search_growth * self._kind_search_at
@@ -183,10 +185,11 @@ class DetectionRefiner:
         proposals = self._options.proposals if self._scans.total >= self._options.proposals_from else 0
         warm_start = None if search_kinds or self._previous is None else WarmStart(*self._previous)
         effort = Effort(warm_start, proposals, rounds=0)
-        self._previous = self._refine(detections, grid, self._scans.pieces(), effort)
+        cells = MapCells.of(grid)
+        self._previous = self._refine(detections, grid, cells, self._scans.pieces(), effort)
         refined, noise_std = self._previous
         stands = WarmStart(refined, noise_std)
-        refined = self._correct(refined, grid, noise_std, self._scans.pieces, Effort(stands, rounds=0))
+        refined = self._correct(refined, grid, cells, noise_std, self._scans.pieces, Effort(stands, rounds=0))
         self._recent.end_look()
         return self._with_frame_uncertainty(refined), noise_std
 
@@ -206,16 +209,19 @@ class DetectionRefiner:
         Returns:
             The refined detections and the range noise (m), None where no ray passes any of them.
         """
+        from detect.refinement.map_cells import MapCells
         from detect.refinement.refine import THOROUGH
 
-        refined, noise_std = self._refine(detections, grid, scans(), THOROUGH)
-        refined = self._correct(refined, grid, noise_std, scans, THOROUGH)
+        cells = MapCells.of(grid)
+        refined, noise_std = self._refine(detections, grid, cells, scans(), THOROUGH)
+        refined = self._correct(refined, grid, cells, noise_std, scans, THOROUGH)
         return self._with_frame_uncertainty(refined), noise_std
 
     def _correct(
         self,
         detections: Detections,
         grid: OccupancyGrid,
+        cells: MapCells,
         noise_std: float | None,
         scans: Callable[[], Iterable[tuple[Scan, Pose2D]]],
         effort: Effort,
@@ -226,15 +232,22 @@ class DetectionRefiner:
             return detections
         from replay.moved_primitives import Look
 
-        return self._moved.correct(Look(detections, grid, noise_std, recent, self._scans.pieces()), scans, effort)
+        return self._moved.correct(
+            Look(detections, grid, cells, noise_std, recent, self._scans.pieces()), scans, effort
+        )
 
     def _refine(
-        self, detections: Detections, grid: OccupancyGrid, scans: Iterable[tuple[Scan, Pose2D]], effort: Effort
+        self,
+        detections: Detections,
+        grid: OccupancyGrid,
+        cells: MapCells,
+        scans: Iterable[tuple[Scan, Pose2D]],
+        effort: Effort,
     ) -> tuple[Detections, float | None]:
         # imported when it is needed: a replay without refinement starts faster
         from detect.refinement.refine import refine_detections
 
-        return refine_detections(detections, scans, grid, self._noise_std, cores(), effort)
+        return refine_detections(detections, scans, grid, self._noise_std, cores(), effort, cells=cells)
 
     def _with_frame_uncertainty(self, detections: Detections) -> Detections:
         """Add the uncertainty of the map frame's pose to that of the detections."""

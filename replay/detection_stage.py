@@ -106,6 +106,7 @@ class DetectionStage:
         self._interval, self.note = interval.scans, interval.note
         self._refiner = self._make_refiner(options, frame) if options.refine else None
         self._tracker = preload(_tracker) if self.streaming else None
+        self._has_tracks = False
         self._truth = truth
         self._timer = timer
 
@@ -188,6 +189,9 @@ class DetectionStage:
         """Return the track of each detection; without a tracker, number them in their order."""
         if self._tracker is None:
             return tuple(TrackIdentity(number) for number in range(1, len(detections.found) + 1))
+        if not detections.found and not self._has_tracks:
+            return ()  # nor need the tracker be loaded yet
+        self._has_tracks = True
         tracks = self._tracker.result().update(detections.found, stamp)
         return tuple(TrackIdentity(track.id, track.confirmed, track.std) for track in tracks)
 

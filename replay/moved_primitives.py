@@ -16,6 +16,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from detect.detection import Detection, Detections, Rejection
+from detect.refinement.map_cells import MapCells
 from detect.refinement.refine import Effort, WarmStart, refine_detections
 from detect.refinement.standing import Judgement, Verdict, judge_places
 from mapping.grid import UNKNOWN, OccupancyGrid
@@ -53,6 +54,7 @@ class Look:
     Attributes:
         detections: What was refined by all scans so far.
         grid: Their map.
+        cells: The map's cells as refinement takes them.
         noise_std: The range noise (m).
         recent: The pieces of the recent scans.
         scans: The pieces of a subset of all scans.
@@ -60,6 +62,7 @@ class Look:
 
     detections: Detections
     grid: OccupancyGrid
+    cells: MapCells
     noise_std: float
     recent: Pieces
     scans: Pieces
@@ -106,7 +109,7 @@ class MovedPrimitives:
             The detections as the recent scans have them; the same ones where these contradict nothing.
         """
         found = look.detections.found
-        judged = self._judge(found, look.recent, look.grid, look.noise_std)
+        judged = self._judge(found, look.recent, look.cells, look.noise_std)
         stands = [d for d, judgement in zip(found, judged, strict=True) if judgement.verdict is Verdict.STANDS]
         self._moved = tuple(moved for moved in self._moved if not self._stood_always(moved, stands, look))
         if len(stands) == len(found) and not self._moved:
@@ -129,7 +132,7 @@ class MovedPrimitives:
         since = moved.since or look.since
         older = [piece for piece in look.scans if piece[0].stamp < since]
         later = [piece for piece in look.scans if piece[0].stamp >= since]
-        before, after = (self._judge(rivals, scans, look.grid, look.noise_std) for scans in (older, later))
+        before, after = (self._judge(rivals, scans, look.cells, look.noise_std) for scans in (older, later))
         return any(first.is_seen and second.is_seen for first, second in zip(before, after, strict=True))
 
     def _refine_moved(
@@ -151,28 +154,29 @@ class MovedPrimitives:
         new = _since(self._without_overlaps([*recent, *nearby], self._moved), look.since).found
         pieces = list(scans()) if self._moved else look.recent
         refined = self._refine([*self._moved, *new], look, grid, pieces, effort)
-        again = self._judge(refined, look.recent, grid, look.noise_std)
+        cells = MapCells.of(grid)
+        again = self._judge(refined, look.recent, cells, look.noise_std)
         contradicted = [judgement.verdict is not Verdict.STANDS for judgement in again]
         lost = [d.since != look.since and wrong for d, wrong in zip(refined, contradicted, strict=True)]
         if any(lost):
             kept = [d for d, away in zip(refined, lost, strict=True) if not away]
             new = _since(self._without_overlaps([*recent, *_moved_nearby(refined, again)], kept), look.since).found
             refined = self._refine([*kept, *new], look, grid, pieces, effort)
-        refined += self._still_standing(refined, look, grid)
+        refined += self._still_standing(refined, look, cells)
         known = [d for d in stands if not self._shares(d, self._moved)]
         arrived = [d for d in refined if not self._shares(d, known)]
-        return tuple(arrived if self._moved else self._not_there_before(arrived, look, grid))
+        return tuple(arrived if self._moved else self._not_there_before(arrived, look, cells))
 
-    def _still_standing(self, refined: Sequence[Detection], look: Look, grid: OccupancyGrid) -> list[Detection]:
+    def _still_standing(self, refined: Sequence[Detection], look: Look, cells: MapCells) -> list[Detection]:
         """Return what moved before and is too little seen now to be refined, as it was, if nothing contradicts it."""
         unseen = self._without_overlaps(self._moved, refined)
-        judged = self._judge(unseen, look.recent, grid, look.noise_std)
+        judged = self._judge(unseen, look.recent, cells, look.noise_std)
         return [d for d, judgement in zip(unseen, judged, strict=True) if judgement.verdict is Verdict.STANDS]
 
-    def _not_there_before(self, arrived: list[Detection], look: Look, grid: OccupancyGrid) -> list[Detection]:
+    def _not_there_before(self, arrived: list[Detection], look: Look, cells: MapCells) -> list[Detection]:
         """Return those that the scans before the recent ones contradict."""
         older = [piece for piece in look.scans if piece[0].stamp < look.since]
-        judged = self._judge(arrived, older, grid, look.noise_std)
+        judged = self._judge(arrived, older, cells, look.noise_std)
         return [d for d, judgement in zip(arrived, judged, strict=True) if judgement.verdict is not Verdict.STANDS]
 
     def _refine(
@@ -185,9 +189,9 @@ class MovedPrimitives:
         return list(refined.found)
 
     def _judge(
-        self, detections: Sequence[Detection], scans: Pieces, grid: OccupancyGrid, noise_std: float
+        self, detections: Sequence[Detection], scans: Pieces, cells: MapCells, noise_std: float
     ) -> list[Judgement]:
-        return judge_places(detections, scans, grid, noise_std, cores(), self._slack)
+        return judge_places(detections, scans, cells, noise_std, cores(), self._slack)
 
     def _without_overlaps(self, detections: Sequence[Detection], others: Sequence[Detection]) -> list[Detection]:
         """Return those that overlap none of some others, and none before them."""

@@ -108,6 +108,7 @@ def refine_detections(
     threads: int = 2,
     effort: Effort = THOROUGH,
     options: RefinementOptions = DEFAULTS,
+    cells: MapCells | None = None,
 ) -> tuple[Detections, float | None]:
     """Refine a map's detections, and find what the networks missed.
 
@@ -119,12 +120,13 @@ def refine_detections(
         threads: How many are used; results do not depend on it.
         effort: How thoroughly.
         options: Numeric parameters.
+        cells: Those of the map, where they are known already.
 
     Returns:
         What the rays support, likeliest kinds first, and what they do not, with the reasons; and the noise (m), None
         where nothing is supported.
     """
-    cells = MapCells.of(grid, options.map, options.lines)
+    cells = cells or MapCells.of(grid, options.map, options.lines)
     wanted, undecided = _candidates_of(detections, cells, effort, options)
     found = len(detections.found)
     warm_start = effort.warm_start

@@ -25,7 +25,6 @@ from detect.refinement.map_cells import MapCells
 from detect.refinement.options import DEFAULTS, RefinementOptions, StandingOptions
 from detect.refinement.rays import collect_rays
 from detect.refinement.sensor_model import BeamModel
-from mapping.grid import OccupancyGrid
 from prim.scan import Scan
 from prim.se2 import Pose2D
 from prim.shapes import Primitive, angle_error
@@ -62,7 +61,7 @@ class Judgement:
 def judge_places(
     detections: Sequence[Detection],
     scans: Iterable[tuple[Scan, Pose2D]],
-    grid: OccupancyGrid,
+    cells: MapCells,
     noise_std: float,
     threads: int,
     slack: float = 0.0,
@@ -73,7 +72,7 @@ def judge_places(
     Args:
         detections: The fitted primitives.
         scans: The scans, with the laser's poses.
-        grid: The map that shows what is behind the primitives.
+        cells: Those of the map that shows what is behind the primitives.
         noise_std: Range noise (m).
         threads: How many are used.
         slack: What the poses' errors alone may displace a primitive by (m).
@@ -84,7 +83,6 @@ def judge_places(
     """
     if not detections:
         return []
-    cells = MapCells.of(grid, options.map, options.lines)
     primitives = [detection.primitive for detection in detections]
     bundles, span, max_noise = collect_rays(scans, primitives, options.rays.fitted_reach, options)
     candidates = [

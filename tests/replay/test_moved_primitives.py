@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from detect.detection import Detection
+from detect.refinement.map_cells import MapCells
 from detect.refinement.rays import collect_rays
 from detect.refinement.standing import Verdict, judge_places
 from mapping.mapper import make_mapper
@@ -46,7 +47,10 @@ def verdicts(found: list[Primitive], scans: list[tuple[Scan, Pose2D]], slack: fl
         mapper.update(scan, pose)
     box, crop = (0.0, 0.0, 0.0, 0.0), np.zeros((1, 1), np.uint8)
     detections = [Detection(primitive, 1.0, box, crop) for primitive in found]
-    return [judgement.verdict for judgement in judge_places(detections, scans, mapper.grid(), NOISE, 2, slack)]
+    return [
+        judgement.verdict
+        for judgement in judge_places(detections, scans, MapCells.of(mapper.grid()), NOISE, 2, slack)
+    ]
 
 
 def test_what_stands_is_told_from_what_was_moved_and_what_is_gone() -> None:
