@@ -4,8 +4,8 @@
 
 Sessions are driven for 40 s at 5 scans a second (seeds from 70000; with primitives that can be pushed from 90000)
 with exact poses and a range noise of 50 mm; the detector runs every 20 scans. A primitive is pushed where its path is
-longer than 20 mm. Its id persists where all confirmed detections of it (those that overlap it most) have the id of
-the first one. Its place is compared with the truth at the second look since it was pushed, and at the end; a
+longer than 20 mm. Its id persists where all confirmed detections of it (IoU of at least 0.5) have the id of the
+first one. Its place is compared with the truth at the second look since it was pushed, and at the end; a
 primitive that is not detected counts as infinitely far. A false track is one that is confirmed at the end and
 overlaps no primitive with an IoU of 0.5.
 """
@@ -40,6 +40,9 @@ FIRST_SEED = {False: 70_000, True: 90_000}
 PUSHED = 0.02
 """m; primitives whose path is longer were pushed."""
 
+SAME_IOU = 0.5
+"""Outlines with this intersection over union are one primitive's."""
+
 STILL = 1e-3
 """m; those that moved by less since the look before stand."""
 
@@ -70,11 +73,11 @@ class Counted:
     final: list[float]
 
 
-def distances(result: DetectionResult) -> dict[int, tuple[float, TrackIdentity]]:
-    """Return by index of the true primitives the distance (m) and the track of what overlaps them most."""
+def overlapping(result: DetectionResult) -> dict[int, tuple[float, TrackIdentity | None, float]]:
+    """Return by index of the true primitives what overlaps them most: its distance (m), its track, and the IoU."""
     detected = [detection.primitive for detection in result.detections.found]
     return {
-        pair.truth: (pair.position, result.identities[pair.detection])
+        pair.truth: (pair.position, result.identities[pair.detection], pair.iou)
         for pair in match_primitives(detected, result.truth)
     }
 
@@ -91,8 +94,8 @@ def follow(results: Sequence[DetectionResult], k: int) -> tuple[bool, Counted]:
     """
     places = np.array([(result.truth[k].x, result.truth[k].y) for result in results])
     steps = np.hypot(*np.diff(places, axis=0).T)
-    found = [distances(result).get(k, (math.inf, None)) for result in results]
-    ids = [identity.id for _, identity in found if identity is not None and identity.confirmed]
+    found = [overlapping(result).get(k, (math.inf, None, 0.0)) for result in results]
+    ids = [identity.id for _, identity, iou in found if identity and identity.confirmed and iou >= SAME_IOU]
     settled = [found[i + 2][0] for i in range(len(steps) - 1) if steps[i] > STILL > steps[i + 1]]
     counted = Counted([len(set(ids)) == 1] if ids else [], settled, [found[-1][0]])
     return bool(steps.sum() > PUSHED), counted
@@ -120,7 +123,7 @@ def session(seed: int, mapper: str, every: int, movable: bool) -> tuple[list[tup
     last = collector.results[-1]
     followed = [follow(collector.results, k) for k in range(len(last.truth))]
     detected = [detection.primitive for detection in last.detections.found]
-    true = {pair.detection for pair in match_primitives(detected, last.truth) if pair.iou >= 0.5}
+    true = {pair.detection for pair in match_primitives(detected, last.truth) if pair.iou >= SAME_IOU}
     return followed, sum(identity.confirmed for k, identity in enumerate(last.identities) if k not in true)
 
 

@@ -48,7 +48,7 @@ class TrackerOptions:
     confirm_after: int = 2
     """Detections that confirm a track."""
 
-    delete_after: int = 3
+    delete_after: int = 5
     """Consecutive updates without a detection that delete a confirmed track."""
 
     max_speed: float = 0.2
@@ -373,7 +373,8 @@ class Tracker:
         """Return the rank of an association, 0 the best; None where it is impossible.
 
         In the narrow gate are 0, where kind and sizes agree, and 2, where they do not; in the wide one are 1, if it
-        is known that the detected primitive moved, and 3.
+        is known that the detected primitive moved, and 3 if not. Where kind or sizes do not agree, the wide gate is
+        open to what is known to have moved, and comes last: what is pushed is often fitted as another kind at first.
         """
         options, primitive = self.options, detection.primitive
         distance = track.distance(primitive, stamp)
@@ -381,9 +382,11 @@ class Tracker:
         if distance <= _narrow_gate(primitive, track.primitive, options):
             return 0 if alike else 2
         reach = _seconds(track.stamp, stamp) * options.max_speed
-        if not (track.confirmed and alike and distance <= reach):
+        if not track.confirmed or distance > reach:
             return None
-        return 3 if detection.since is None else 1
+        if detection.since is None:
+            return 3 if alike else None
+        return 1 if alike else 4
 
 
 def _seconds(before: int, now: int) -> float:
