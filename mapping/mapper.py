@@ -67,6 +67,19 @@ MAPPERS = tuple(name.value for name in MapperName)
 SENSOR_MODELS = tuple(name.value for name in SensorModelName)
 
 
+def takes_noise(name: str, sensor_model: str) -> bool:
+    """Say whether a mapper takes the range noise.
+
+    Args:
+        name: One of MAPPERS.
+        sensor_model: One of SENSOR_MODELS.
+
+    Returns:
+        Whether it does.
+    """
+    return name == MapperName.FORWARD or sensor_model == SensorModelName.GAUSSIAN
+
+
 def check_mapper(name: str, sensor_model: str = "eq4", noise_std: float | None = None) -> None:
     """Check that a mapper and a sensor model exist and fit together.
 
@@ -86,7 +99,7 @@ def check_mapper(name: str, sensor_model: str = "eq4", noise_std: float | None =
         raise UsageError(f"--sensor-model goes with --mapper prob, not with --mapper {name}")
     if noise_std is None:
         return
-    if name != "forward" and sensor_model != "gaussian":
+    if not takes_noise(name, sensor_model):
         raise UsageError("--noise-std goes with --mapper forward, or with --mapper prob --sensor-model gaussian")
     if not 0 < noise_std < math.inf:
         raise UsageError(f"--noise-std is {noise_std:g}: it must be above 0")

@@ -29,6 +29,6 @@ def lazy_exports(
         return value
 
     def names() -> list[str]:
-        return sorted({*vars(sys.modules[package]), *exports})
+        return sorted(exports)
 
     return list(exports), load, names

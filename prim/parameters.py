@@ -15,7 +15,7 @@ from prim.errors import LogReadError, PrimError, UsageError
 if TYPE_CHECKING:
     from pydantic import BaseModel
 
-_FLAG = re.compile(r"--([a-z][a-z0-9-]*)")
+_FLAG = re.compile(r"(?<![\w./-])--([a-z][a-z0-9-]*)")
 
 _ANGLES = {" X Y DEG": " (x, y, radians)"}
 """What stands behind an option of the command line, and behind the parameter."""
@@ -42,6 +42,8 @@ def checked_path(name: str, value: object) -> Path:
 def checked_keywords(keywords: type, given: Mapping[str, Any], others: Collection[str] = ()) -> dict[str, Any]:
     """Check keyword arguments against the types of a TypedDict; numbers and switches may be text, as pydantic allows.
 
+    What is None is left out: it is as if it were not given.
+
     Args:
         keywords: The TypedDict.
         given: The arguments.
@@ -59,14 +61,16 @@ def checked_keywords(keywords: type, given: Mapping[str, Any], others: Collectio
     for name in given:
         if name not in keywords.__annotations__:
             raise UsageError(f"there is no parameter {name!r}{_suggestion(name, names)}")
+    given = {name: value for name, value in given.items() if value is not None}
     values = {name: value.tolist() if hasattr(value, "tolist") else value for name, value in given.items()}
     model = _model(keywords)
     try:
         checked = model(**values)
     except ValidationError as error:
-        first = error.errors()[0]
-        wrong, reason = str(first["loc"][0]), first["msg"].removeprefix("Value error, ")
-        raise UsageError(f"{wrong} is {given[wrong]!r}: {reason[0].lower()}{reason[1:]}") from None
+        wrong = str(error.errors()[0]["loc"][0])
+        reasons = [one["msg"].removeprefix("Value error, ") for one in error.errors() if one["loc"][0] == wrong]
+        said = ", or ".join(dict.fromkeys(f"{reason[0].lower()}{reason[1:]}" for reason in reasons))
+        raise UsageError(f"{wrong} is {given[wrong]!r}: {said}") from None
     return {name: getattr(checked, name) for name in values}
 
 

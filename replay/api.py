@@ -6,6 +6,7 @@ import math
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
+from numbers import Real
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Unpack
 
@@ -28,7 +29,7 @@ from prim.shapes import Primitive
 from prim.threads import cores
 from prim.world import Bounds
 from replay.exports import check_distinct, log_stem, write_map, write_report, write_trajectory
-from replay.found_primitives import FoundPrimitive, by_name, found_primitives
+from replay.found_primitives import FoundPrimitive, found_primitives
 from replay.keywords import PARAMETERS, SWITCHES, ReplayKeywords, replay_options
 from replay.localization import localize, pose_scans
 from replay.notes import pluralize
@@ -160,7 +161,10 @@ def replay(
         OutputError: The recording cannot be written.
     """
     with _errors():
-        return _as_result(_pipeline(log, save, progress, options).run())
+        pipeline = _pipeline(log, save, progress, options)
+        if len(pipeline.options.mappers) > 1:
+            raise UsageError(f"mapper is {pipeline.options.mapper}: replay_each has a result for each of several")
+        return _as_result(pipeline.run())
 
 
 def replay_each(
@@ -263,10 +267,7 @@ def make_mapper(
     """
     given = {"resolution": resolution, "bounds": bounds, "sensor_model": sensor_model, "noise_std": noise_std}
     with _errors():
-        checked = checked_keywords(ReplayKeywords, given)
-        return mapping.mapper.make_mapper(
-            name, checked["resolution"], checked["bounds"], checked["sensor_model"], checked["noise_std"]
-        )
+        return mapping.mapper.make_mapper(name, **checked_keywords(ReplayKeywords, given))
 
 
 def refine(
@@ -294,10 +295,11 @@ def refine(
     """
     from detect.refinement.map_cells import MapCells
     from detect.refinement.options import DEFAULTS
-    from detect.refinement.refine import Refinement, rejection_reason
+    from detect.refinement.refine import Refinement, detection_of, rejection_reason
 
-    guesses = [guess.primitive if isinstance(guess, FoundPrimitive) else guess for guess in primitives]
-    _check_refinable(guesses, grid, noise_std)
+    guesses, noise_std = _checked_guesses(primitives), _checked_noise(noise_std)
+    if not isinstance(grid, OccupancyGrid):
+        raise UsageError(f"grid is {type(grid).__name__}: give a map, such as result.grid")
     fitted = [
         k for k, guess in enumerate(guesses) if not _overlaps(guess, guesses[:k], DEFAULTS.acceptance.max_shared)
     ]
@@ -306,20 +308,7 @@ def refine(
     of_guess = dict(zip(fitted, found, strict=True))
     fits = [of_guess.get(k) for k in range(len(guesses))]
     return [
-        None
-        if fit is None or rejection_reason(fit)
-        else FoundPrimitive(
-            id=number,
-            kind=fit.primitive.kind,
-            x=fit.primitive.x,
-            y=fit.primitive.y,
-            theta=fit.primitive.theta,
-            size=fit.primitive.sizes,
-            score=fit.score,
-            stage="refined",
-            std=fit.std,
-            chances=by_name(fit.kind_probabilities),
-        )
+        None if fit is None or rejection_reason(fit) else FoundPrimitive.of(detection_of(fit), number)
         for number, fit in enumerate(fits, 1)
     ]
 
@@ -328,15 +317,24 @@ def _overlaps(guess: Primitive, others: Iterable[Primitive], limit: float) -> bo
     return any(overlap_coefficient(guess, other) > limit for other in others)
 
 
-def _check_refinable(guesses: Iterable[object], grid: object, noise_std: object) -> None:
-    """Raise UsageError where what is to be refined is of another kind."""
+def _checked_guesses(primitives: object) -> list[Primitive]:
+    """Return primitives; raise UsageError where there is something else."""
+    if not isinstance(primitives, Iterable):
+        raise UsageError(f"primitives is {type(primitives).__name__}: give a list, such as result.primitives")
+    guesses = [guess.primitive if isinstance(guess, FoundPrimitive) else guess for guess in primitives]
     for guess in guesses:
         if not isinstance(guess, Primitive):
             raise UsageError(f"primitives holds {type(guess).__name__}: give prim.Primitive or what a replay found")
-    if not isinstance(grid, OccupancyGrid):
-        raise UsageError(f"grid is {type(grid).__name__}: give a map, such as result.grid")
-    if noise_std is not None and not (isinstance(noise_std, float | int) and 0 < noise_std < math.inf):
-        raise UsageError(f"noise_std is {noise_std!r}: it must be above 0")
+    return guesses
+
+
+def _checked_noise(noise_std: Any) -> float | None:
+    """Return a standard deviation; raise UsageError where it is none."""
+    if noise_std is None:
+        return None
+    if not isinstance(noise_std, Real | np.floating) or not 0 < float(noise_std) < math.inf:
+        raise UsageError(f"noise_std is {noise_std!r}: it must be a number above 0")
+    return float(noise_std)
 
 
 def _checked_pairs(scans: Iterable[object]) -> Iterator[tuple[Scan, Pose2D]]:
@@ -361,6 +359,8 @@ def _pipeline(
     """Make the pipeline of a replay, its arguments checked. Raises UsageError."""
     path = checked_path("log", log)
     chosen = replay_options(**checked_keywords(ReplayKeywords, options, ("save", "progress")))
+    if progress is not None and not callable(progress):
+        raise UsageError(f"progress is {progress!r}: give a function of two numbers")
     recording = None if save is None else checked_path("save", save)
     check_distinct([path], [recording] if recording else [])
     return Pipeline(path, chosen, _viewer(recording), progress)

@@ -43,6 +43,7 @@ class Branch:
         shared: The timer of the replay.
 
     Attributes:
+        options: Options of the replay, with this mapper alone.
         mapper: The mapper's name.
         seconds: The time of each stage of this branch alone, by name (s).
     """
@@ -87,7 +88,7 @@ class Branch:
         position, stamp = posed.position, posed.scan.stamp
         seconds = self._mapping.update(posed)
         detections = self._detection.update(posed, self._mapping.mapper)
-        grid = self._mapping.snapshot(position)
+        grid = self._mapping.snapshot(position, detections is not None)
         scores = None if grid is None else self._evaluator.score(grid)
         with self._timer.stage("viewer"):
             self._viewer.show_mapping_time(self.mapper, posed, seconds)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+import shlex
 import sys
 import time
 from collections.abc import Iterable, Sequence
@@ -118,7 +119,8 @@ def replay(
         str | None,
         typer.Option(
             metavar="N|end",
-            help="Detect primitives every N scans and at the end, or at the end only. [default: about 10 times]",
+            help="Detect primitives after the first scan, every N scans and at the end; or at the end only. "
+            "[default: about 10 times; without a viewer, end]",
         ),
     ] = None,
     no_refine: Annotated[
@@ -134,10 +136,18 @@ def replay(
         str | None, typer.Option(metavar="URL", help="Show the replay in a viewer that runs at URL.")
     ] = None,
     serve: Annotated[bool, typer.Option("--serve", help="Serve the replay to web browsers.")] = False,
-    no_viewer: Annotated[bool, typer.Option("--no-viewer", help="Make no rerun recording.")] = False,
-    report: Annotated[Path | None, typer.Option(metavar="OUT.json", help="Write the report here.")] = None,
+    no_viewer: Annotated[
+        bool, typer.Option("--no-viewer", help="Make no rerun recording, and detect primitives at the end only.")
+    ] = False,
+    report: Annotated[
+        Path | None,
+        typer.Option(metavar="OUT.json", help="Write the report here; of several mappers, to OUT.MAPPER.json."),
+    ] = None,
     map_output: Annotated[
-        Path | None, typer.Option("--map", metavar="OUT", help="Write OUT.pgm and OUT.yaml for nav2.")
+        Path | None,
+        typer.Option(
+            "--map", metavar="OUT", help="Write OUT.pgm and OUT.yaml for nav2; of several mappers, OUT.MAPPER.pgm."
+        ),
     ] = None,
     trajectory: Annotated[
         Path | None, typer.Option(metavar="OUT.tum", help="Write the laser's poses in TUM's format.")
@@ -239,9 +249,12 @@ class OutputFiles:
         Returns:
             The files, of which all mappers share the recording and the trajectory.
         """
+        from replay.exports import map_stem
+
         if len(mappers) == 1:
             return self
-        report, stem = (path and _with_name_of(mapper, path) for path in (self.report, self.map))
+        report = self.report and _with_name_of(mapper, self.report)
+        stem = self.map and self.map.with_name(f"{map_stem(self.map)}.{mapper}")
         return dataclasses.replace(self, report=report, map=stem)
 
     def paths(self, mappers: Sequence[str]) -> list[Path]:
@@ -349,7 +362,7 @@ def _print_results(results: Sequence[ReplayResult], outputs: OutputFiles, verbos
     mappers = [result.options.mapper for result in results]
     typer.echo("wrote: " + ", ".join(str(path) for path in outputs.paths(mappers)))
     if outputs.recording:
-        typer.echo(f"open:  rerun {outputs.recording}")
+        typer.echo(f"open:  rerun {shlex.quote(str(outputs.recording))}")
 
 
 def _print_rejected(result: ReplayResult) -> None:
@@ -376,7 +389,7 @@ def _print_tables(results: Sequence[ReplayResult], verbose: bool) -> None:
 
 
 def _print_table(rows: Iterable[Sequence[str]], header: Sequence[str] = ()) -> None:
-    """Print rows of cells, text or numbers under a header where there is one."""
+    """Print rows of cells; those under a header hold numbers but for the first, and stand at the right."""
     from rich.console import Console
     from rich.table import Table
     from rich.text import Text

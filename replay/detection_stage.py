@@ -12,8 +12,8 @@ import numpy as np
 
 from detect.networks.weights import WeightsError, shipped_weights
 from mapping.grid import GridFrame, OccupancyGrid
-from mapping.mapper import Mapper, make_mapper
-from prim.choices import MapperName
+from mapping.mapper import Mapper, make_mapper, takes_noise
+from prim.choices import SensorModelName
 from prim.errors import UsageError
 from prim.metrics import DetectionErrors, detection_errors
 from prim.scan import PosedScan, Scan
@@ -301,5 +301,6 @@ def _own_mapper(detector: Detector, options: ReplayOptions, frame: GridFrame) ->
 def _detectors_mapper(detector: Detector, options: ReplayOptions, frame: GridFrame) -> Mapper:
     """Make a mapper of the kind and the cells that the detector was trained on."""
     cell = detector.card.resolution
-    noise_std = options.noise_std if options.mapper == MapperName.FORWARD else None
-    return make_mapper(options.mapper, cell, GridFrame.covering(frame.bounds, cell).bounds, "eq4", noise_std)
+    model = SensorModelName.EQ4
+    noise_std = options.noise_std if takes_noise(options.mapper, model) else None
+    return make_mapper(options.mapper, cell, GridFrame.covering(frame.bounds, cell).bounds, model, noise_std)

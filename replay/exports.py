@@ -112,8 +112,13 @@ def log_stem(path: Path) -> str:
 
 def map_files(stem: Path) -> tuple[Path, Path]:
     """Return the paths of a map's image and its description; ``stem`` may have either's suffix."""
-    name = stem.name.removesuffix(".yaml").removesuffix(".pgm")
+    name = map_stem(stem)
     return stem.with_name(f"{name}.pgm"), stem.with_name(f"{name}.yaml")
+
+
+def map_stem(path: Path) -> str:
+    """Return the name of a map's files without their suffixes."""
+    return path.name.removesuffix(".yaml").removesuffix(".pgm")
 
 
 @contextmanager

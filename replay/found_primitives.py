@@ -4,10 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from prim.shapes import Kind, Primitive
 from replay.detection_stage import DetectionResult
+
+if TYPE_CHECKING:
+    from detect.detection import Detection
 
 
 @dataclass(frozen=True)
@@ -38,6 +41,31 @@ class FoundPrimitive:
     std: Mapping[str, float] | None
     chances: Mapping[str, float] | None
 
+    @classmethod
+    def of(cls, detection: Detection, number: int) -> FoundPrimitive:
+        """Return a detection under a number.
+
+        Args:
+            detection: The detection.
+            number: Its id.
+
+        Returns:
+            The primitive that was found.
+        """
+        primitive, chances = detection.primitive, detection.kind_probabilities
+        return cls(
+            id=number,
+            kind=primitive.kind,
+            x=primitive.x,
+            y=primitive.y,
+            theta=primitive.theta,
+            size=primitive.sizes,
+            score=detection.score,
+            stage="detected" if detection.std is None else "refined",
+            std=detection.std,
+            chances=None if chances is None else {str(kind): chance for kind, chance in chances.items()},
+        )
+
     @property
     def primitive(self) -> Primitive:
         """Kind, pose and size alone."""
@@ -54,23 +82,5 @@ def found_primitives(result: DetectionResult | None) -> tuple[FoundPrimitive, ..
     """Return the primitives of a detection, highest score first; none where detection was skipped."""
     if result is None:
         return ()
-    return tuple(
-        FoundPrimitive(
-            id=identity.id,
-            kind=(primitive := detection.primitive).kind,
-            x=primitive.x,
-            y=primitive.y,
-            theta=primitive.theta,
-            size=primitive.sizes,
-            score=detection.score,
-            stage="detected" if detection.std is None else "refined",
-            std=detection.std,
-            chances=by_name(detection.kind_probabilities),
-        )
-        for identity, detection in zip(result.identities, result.detections.found, strict=True)
-    )
-
-
-def by_name(kind_probabilities: Mapping[Kind, float] | None) -> dict[str, float] | None:
-    """Return the probabilities of the kinds by their names; None where they are not known."""
-    return None if kind_probabilities is None else {str(kind): chance for kind, chance in kind_probabilities.items()}
+    pairs = zip(result.identities, result.detections.found, strict=True)
+    return tuple(FoundPrimitive.of(detection, identity.id) for identity, detection in pairs)

@@ -77,6 +77,7 @@ def detection_interval(options: ReplayOptions, scans: int, cells: int, is_shown:
     if not is_shown:
         return NEVER
     times = min(DETECTIONS, DETECTED_CELLS // cells)
+    times = 0 if times < min(2, scans) else times  # a single one, after the first scan, shows nothing
     if times >= min(DETECTIONS, scans):
         return _spread(times, scans)
     often = f"{pluralize(times, 'time')} along the way" if times else "at the end only"

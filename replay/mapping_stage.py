@@ -80,9 +80,17 @@ class MappingStage:
         self.usage.count(posed.scan)
         return elapsed
 
-    def snapshot(self, position: int) -> OccupancyGrid | None:
-        """Return the map so far where a snapshot is due after the scan at ``position`` (in the selection)."""
-        if not self._snapshot_interval or position % self._snapshot_interval:
+    def snapshot(self, position: int, is_searched: bool) -> OccupancyGrid | None:
+        """Return the map so far where it is to be shown.
+
+        Args:
+            position: The latest scan's position in the selection.
+            is_searched: Whether primitives were detected in it: what is drawn over a map is of that map.
+
+        Returns:
+            The map; None where neither that is so, nor a snapshot due.
+        """
+        if not self._snapshot_interval or (position % self._snapshot_interval and not is_searched):
             return None
         with self._timer.stage("map"):
             return self.mapper.grid()

@@ -9,7 +9,7 @@ from typing import Final, Literal
 
 import numpy as np
 
-from mapping.mapper import check_cells, check_mapper
+from mapping.mapper import check_cells, check_mapper, takes_noise
 from prim.choices import MapperName, PoseSourceName, SensorModelName
 from prim.errors import UsageError
 from prim.se2 import Pose2D
@@ -121,8 +121,7 @@ class ReplayOptions:
         settings = []
         for name in self.mappers:
             model = self.sensor_model if name == MapperName.PROB else SensorModelName.EQ4.value
-            takes_noise = name == MapperName.FORWARD or model == SensorModelName.GAUSSIAN
-            settings.append((name, model, self.noise_std if takes_noise else None))
+            settings.append((name, model, self.noise_std if takes_noise(name, model) else None))
         return settings
 
     def _check_mappers(self) -> None:

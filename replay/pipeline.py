@@ -54,11 +54,12 @@ class Pipeline:
 
         Returns:
             The map, its poses and detections, and their evaluation where the log has ground truth.
+
+        Raises:
+            UsageError: The options name several mappers.
         """
         if len(self.options.mappers) > 1:
-            raise UsageError(
-                f"--mapper {self.options.mapper} names several: prim.replay_each() has a result for each"
-            )
+            raise UsageError(f"--mapper {self.options.mapper} names several: run_each() has a result for each")
         return self.run_each()[0]
 
     def run_each(self) -> tuple[ReplayResult, ...]:
@@ -196,6 +197,7 @@ class Pipeline:
                 detection_skipped=branch.detection_skipped,
                 seconds=_added(self._timer.seconds, branch.seconds)
                 | {"total": total - in_branches + sum(branch.seconds.values())},
+                elapsed=total,
             )
             for branch, outcome in zip(branches, outcomes, strict=True)
         )

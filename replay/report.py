@@ -172,7 +172,7 @@ def summary_rows(result: ReplayResult) -> list[tuple[str, str]]:
 def shared_rows(results: Sequence[ReplayResult]) -> list[tuple[str, str]]:
     """Return the rows that hold for all mappers of a replay: name, and value with its unit."""
     rows = [*_log_rows(results[0]), *_pose_rows(results[0]), *_skipped_rows(results)]
-    return [*rows, ("time", f"{sum(result.seconds['total'] for result in results):.2f} s")]
+    return [*rows, ("time", f"{results[0].elapsed:.2f} s")]
 
 
 def comparison_table(results: Sequence[ReplayResult]) -> list[list[str]]:

@@ -40,6 +40,7 @@ class ReplayResult:
         detections: The primitives in the map; None where detection was skipped.
         detection_skipped: Why detection was not possible, where it was wanted; None otherwise.
         seconds: Wall time of each stage, and ``total``, by name (s); without the time of other mappers.
+        elapsed: Wall time (s) of the whole replay, by all mappers.
     """
 
     path: Path
@@ -61,6 +62,7 @@ class ReplayResult:
     detections: DetectionResult | None
     detection_skipped: str | None
     seconds: dict[str, float]
+    elapsed: float
 
 
 def distinct_notes(results: Sequence[ReplayResult]) -> list[str]:

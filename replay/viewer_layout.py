@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from itertools import cycle
 from typing import Any
 
 import rerun as rr
@@ -161,7 +162,7 @@ def _plots(scene: Scene) -> list[Any]:
         plots.append(rrb.Tabs(found, lengths, angle, active_tab=0))
     if scene.has_scores:
         plots.append(_plot("scores", "Map accuracy", axis_y=unit))
-    return [*plots, *_pose_plots(scene), _plot("timing", "Stage timings")]
+    return [*plots, *_pose_plots(scene), _plot("timing", "Mapping time")]
 
 
 def _comparisons(scene: Scene) -> list[Any]:
@@ -193,7 +194,7 @@ def _comparison(scene: Scene, entity: str, series: int, name: str, **properties:
             colors=[color, *[OTHERS_COLOR] * (series - 1)],
             visible_series=[True, *[False] * (series - 1)],
         )
-        for (mapper, path), color in zip(paths.items(), MAPPER_COLORS, strict=False)
+        for (mapper, path), color in zip(paths.items(), cycle(MAPPER_COLORS), strict=False)
     }
     return _plot("/", name, contents=list(paths.values()), overrides=styles, **properties)
 

@@ -52,7 +52,7 @@ NARROW = {
 
 ENDS = {
     ("detect/refinement", "detect"): {"detection"},
-    ("replay/viewing", "replay"): {"result", "report", "detection_stage", "replay_evaluator", "notes"},
+    ("replay/viewing", "replay"): {"result", "report", "detection_stage"},
 }
 """Arrows that lead to these files of a folder alone."""
 

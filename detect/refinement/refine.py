@@ -151,7 +151,7 @@ def refine_detections(
         if result is None or reason:
             rejected.append(_rejection(guess, result, reason))
         else:
-            kept.append(_detection(result, guess))
+            kept.append(detection_of(result, guess))
     judged = {id(rejection) for doubtful, rejection in detections.doubtful if id(doubtful) in undecided}
     rejected += [rejection for rejection in detections.rejected if id(rejection) not in judged]
     kept.sort(key=lambda detection: -detection.score)
@@ -260,22 +260,31 @@ def proposal_rejection_reason(
 
 
 def _rejection(guess: Detection, result: RefinedPrimitive | None, reason: str) -> Rejection:
-    fitted = None if result is None else _detection(result, guess)
+    fitted = None if result is None else detection_of(result, guess)
     return Rejection(guess.primitive.kind, guess.score, guess.primitive.x, guess.primitive.y, reason, fitted)
 
 
-def _detection(result: RefinedPrimitive, guess: Detection) -> Detection:
+def detection_of(result: RefinedPrimitive, guess: Detection | None = None) -> Detection:
+    """Return what was refined as a detection.
+
+    Args:
+        result: What was refined.
+        guess: What it was refined from, where that was a detection: its crop and its ``since`` are kept.
+
+    Returns:
+        The detection.
+    """
     outline = result.primitive.outline()
     (x0, y0), (x1, y1) = outline.min(axis=0).tolist(), outline.max(axis=0).tolist()
     return Detection(
         result.primitive,
         result.score,
         (x0, y0, x1, y1),
-        guess.crop,
+        np.zeros((0, 0), np.uint8) if guess is None else guess.crop,
         result.std,
         result.kind_probabilities,
         result.covariance,
-        guess.since,
+        None if guess is None else guess.since,
     )
 
 

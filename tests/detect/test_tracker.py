@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import math
+import subprocess
+import sys
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -14,6 +17,7 @@ from prim.arrays import FloatArray
 from prim.se2 import angle_difference
 from prim.shapes import Kind, Primitive, angle_error
 
+ROOT = Path(__file__).parents[2]
 SECOND = 10**9
 CROP = np.zeros((1, 1), np.uint8)
 SHAPES = [
@@ -225,3 +229,77 @@ def test_options_set_confirmation_and_gate() -> None:
     assert track.confirmed
     (other,) = tracker.update(detections(replace(SHAPES[2], x=SHAPES[2].x + 0.02)), 0)
     assert other.id == 2
+
+
+def tracked(*steps: list[Detection]) -> list[list[int]]:
+    """Ids at each of some updates, four seconds apart."""
+    tracker = Tracker()
+    return [[track.id for track in tracker.update(step, k * 4 * SECOND)] for k, step in enumerate(steps)]
+
+
+def test_what_is_alike_comes_before_what_is_near() -> None:
+    """In the narrow gates of both a detection belongs to the track of its own kind, though the other's is nearer."""
+    square, circle = Primitive(Kind.SQUARE, 0.0, 0.0, 0.1, (0.2,)), Primitive(Kind.CIRCLE, 0.09, 0.0, None, (0.1,))
+    before = detections(square, circle)
+    assert tracked(before, before, detections(replace(circle, x=0.04))) == [[1, 2], [1, 2], [2]]
+
+
+def test_confirmed_tracks_come_before_tentative_ones() -> None:
+    circle = Primitive(Kind.CIRCLE, 0.0, 0.0, None, (0.1,))
+    near = replace(circle, x=0.07)
+    ids = tracked(
+        detections(circle), detections(circle), detections(circle, near), detections(replace(circle, x=0.05))
+    )
+    assert ids == [[1], [1], [1, 2], [1]]
+
+
+def test_what_is_known_to_have_moved_is_associated_over_its_reach_and_last() -> None:
+    """Also as another kind; but what is alike goes first, and what is not known to have moved is something new."""
+    square = Primitive(Kind.SQUARE, 0.0, 0.0, 0.1, (0.2,))
+    far = replace(square, x=0.5)
+    other = Primitive(Kind.CIRCLE, 0.5, 0.0, None, (0.1,))
+    before = detections(square)
+
+    def moved(*primitives: Primitive) -> list[Detection]:
+        return [replace(detection, since=7) for detection in detections(*primitives)]
+
+    assert tracked(before, before, moved(other))[-1] == [1]
+    assert tracked(before, before, detections(other))[-1] == [2]
+    assert tracked(before, before, moved(replace(other, x=0.4), far))[-1] == [2, 1]
+    assert tracked(before, before, moved(replace(other, x=0.9)))[-1] == [2]
+
+
+def test_what_is_known_to_have_moved_comes_before_what_is_near_and_unlike() -> None:
+    """A pushed square and a circle that comes to stand where it was: the square keeps its id."""
+    square = Primitive(Kind.SQUARE, 0.0, 0.0, 0.1, (0.2,))
+    arrived = Primitive(Kind.CIRCLE, 0.03, 0.0, None, (0.1,))
+    before = detections(square)
+    pushed = [replace(detection, since=7) for detection in detections(replace(square, x=0.5))]
+    assert tracked(before, before, [*detections(arrived), *pushed])[-1] == [2, 1]
+
+
+def test_a_displacement_within_the_least_one_is_no_motion() -> None:
+    """However sure both places are: poses and grids have errors of millimetres."""
+    covariance = 1e-10 * np.eye(3)
+    tracker, circle = Tracker(TrackerOptions(min_std=1e-5)), Primitive(Kind.CIRCLE, 0.0, 0.0, None, (0.1,))
+    for k in range(4):
+        (track,) = tracker.update([detection_with(replace(circle, x=0.004 * (k % 2)), covariance)], k * SECOND)
+    assert not track.best.moving
+    (track,) = tracker.update([detection_with(replace(circle, x=0.02), covariance)], 4 * SECOND)
+    assert track.best.moving
+
+
+def test_the_likelihood_of_filterpy_is_loaded_when_it_is_asked_for() -> None:
+    """The module that stands in for its statistics gives the real one's values, and is gone after the import."""
+    code = "\n".join(
+        [
+            "import sys, numpy as np; from detect.kalman import KalmanFilter",
+            "assert 'scipy.stats' not in sys.modules",
+            "f = KalmanFilter(dim_x=1, dim_z=1); f.H = np.eye(1); f.predict(); f.update(np.array([[0.5]]))",
+            "print(f.log_likelihood)",
+            "from filterpy.stats import logpdf; print(logpdf(f.y, cov=f.S))",
+        ]
+    )
+    run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=ROOT)
+    asked, real = map(float, run.stdout.split())
+    assert asked == pytest.approx(real) and math.isfinite(asked)

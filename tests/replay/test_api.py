@@ -17,6 +17,10 @@ from recorder.session import Session
 from replay import cli
 from replay.api import Result
 from replay.keywords import SWITCHES, ReplayKeywords
+from replay.options import ReplayOptions
+from replay.pipeline import Pipeline
+from replay.report import comparison_table, shared_rows
+from replay.result import distinct_notes
 
 
 @pytest.fixture(scope="module")
@@ -128,6 +132,7 @@ def test_several_mappers_give_a_result_each(noisy_session: Session, tmp_path: Pa
         ({"weights": 5}, "weights is 5"),
         ({"no_detect": True}, "no parameter 'no_detect': give detect=False"),
         ({"sav": "a.rrd"}, "no parameter 'sav': did you mean save?"),
+        ({"progress": 3}, "progress is 3: give a function"),
         ({"verbose": True}, "no parameter 'verbose'; there are"),
         ({"detect": False, "refine": False}, "detect=False excludes detect_every, weights and refine=False"),
         ({"standing_still": True, "pose": "tf"}, "standing_still=True excludes pose and odom_topic"),
@@ -183,6 +188,9 @@ def test_refinement_says_what_it_cannot_take(result: Result, noisy_session: Sess
         ([(1, 2)], scans, result.grid),
         ([guess], [scan for scan, _ in scans], result.grid),
         ([guess], str(noisy_session.path), result.grid),
+        (result, scans, result.grid),
+        (guess, scans, result.grid),
+        ([guess], scans, result.grid, "a"),
     ):
         with pytest.raises(prim.UsageError):
             prim.refine(*arguments)  # type: ignore[arg-type]
@@ -218,6 +226,50 @@ def test_values_may_be_text_and_numbers_of_numpy(noisy_session: Session) -> None
     assert repr(result) == "Result(0 primitives in 40 x 40 cells of prob, 3 scans, poses: truth)"
 
 
+def test_each_mapper_has_the_time_of_its_own_stages(noisy_session: Session) -> None:
+    """Stages do not overlap, and what the mappers share counts for each: totals are at most the elapsed time."""
+    results = Pipeline(noisy_session.path, ReplayOptions(mapper="det,prob,forward")).run_each()
+    for result in results:
+        stages = {name: seconds for name, seconds in result.seconds.items() if name != "total"}
+        assert sum(stages.values()) <= result.seconds["total"] <= result.elapsed == results[0].elapsed
+        others = sum(other.seconds["map"] + other.seconds["refine"] for other in results if other is not result)
+        assert result.seconds["total"] <= result.elapsed - others
+    assert dict(shared_rows(results))["time"] == f"{results[0].elapsed:.2f} s"
+
+
+def test_each_mapper_takes_the_noise_and_the_sensor_model_that_it_can() -> None:
+    options = ReplayOptions(mapper="det,prob,forward", noise_std=0.1, sensor_model="gaussian")
+    taken = [(each.mapper, each.sensor_model, each.noise_std) for each in options.by_mapper()]
+    assert taken == [("det", "eq4", None), ("prob", "gaussian", 0.1), ("forward", "eq4", 0.1)]
+    assert [each.noise_std for each in ReplayOptions(mapper="prob,forward", noise_std=0.2).by_mapper()] == [None, 0.2]
+
+
+def test_notes_of_several_mappers_are_said_once(noisy_session: Session) -> None:
+    results = Pipeline(noisy_session.path, ReplayOptions(mapper="det,prob", bounds=(9, 9, 10, 10))).run_each()
+    assert all(result.notes for result in results) and len(distinct_notes(results)) == len(results[0].notes)
+
+
+def test_a_comparison_has_no_empty_columns(noisy_session: Session) -> None:
+    results = Pipeline(noisy_session.path, ReplayOptions(mapper="det,prob", detect=False)).run_each()
+    names, units, *rows = comparison_table(results)
+    assert names == ["mapper", "map F1", "AUC", "mapping"] and len(units) == 4
+    assert [row[0] for row in rows] == ["det", "prob"] and all(all(row) for row in rows)
+
+
+def test_names_of_files_are_not_translated(in_tmp: Path) -> None:
+    with pytest.raises(prim.LogReadError) as error:
+        prim.replay("x--end.mcap")
+    assert str(error.value).startswith("x--end.mcap: cannot open")
+
+
+def test_none_is_as_if_it_were_not_given(noisy_session: Session, tmp_path: Path) -> None:
+    given = dict.fromkeys(ReplayKeywords.__annotations__) | {"detect": False}
+    result = prim.replay(noisy_session.path, **given)  # type: ignore[arg-type]
+    assert result.report["map"]["mapper"] == "prob"
+    session = prim.record(tmp_path / "a.mcap", **dict.fromkeys(RecordingKeywords.__annotations__))  # type: ignore[arg-type]
+    assert session.scans > 50
+
+
 def test_several_mappers_may_be_a_list(noisy_session: Session) -> None:
     assert list(prim.replay_each(noisy_session.path, mapper=["det", "prob"], detect=False)) == ["det", "prob"]
 
@@ -241,6 +293,7 @@ def test_log_errors_keep_their_parts(tmp_path: Path) -> None:
         ({"colour": "red"}, "no parameter 'colour'"),
         ({"stops": 2}, "stops is 2"),
         ({"size": "2x2"}, "size is '2x2'"),
+        ({"seed": -1}, "seed is -1: it must not be below 0"),
         ({"per_kind": "many"}, "per_kind is 'many'"),
         ({"rays": 3.5}, "rays is 3.5"),
         ({"world": {}}, "world is {}"),

@@ -293,6 +293,15 @@ def test_several_mappers_leave_one_recording_and_a_report_each(replay: Run, nois
     }
 
 
+def test_the_line_that_opens_the_recording_can_be_pasted(replay: Run, noisy_session: Session) -> None:
+    Path("my log.v1.mcap").write_bytes(noisy_session.path.read_bytes())
+    code, out, _ = replay("my log.v1.mcap", "--mapper", "det,prob", "--no-detect", "--map", "out.v1")
+    assert code == 0 and out.splitlines()[-1] == "open:  rerun 'my log.v1.det-prob.rrd'"
+    assert {path.name for path in Path().glob("out*")} == {
+        f"out.v1.{mapper}.{suffix}" for mapper in ("det", "prob") for suffix in ("pgm", "yaml")
+    }
+
+
 def test_a_named_report_of_several_mappers_gets_their_names(replay: Run, noisy_session: Session) -> None:
     options = ["--mapper", "det,prob", "--no-viewer", "--report", "a.json", "--no-detect"]
     assert replay(noisy_session.path, *options)[0] == 0

@@ -129,6 +129,34 @@ def test_intermediate_detections_are_on_the_timeline(
     assert "| 1 |" in value(timed(rows["/detections"])[-1], "text")[0]
 
 
+@pytest.mark.parametrize("every", [23, 22, 5])
+def test_the_last_scan_is_searched_once(noisy_session: Session, detector: FakeDetector, every: int) -> None:
+    """Or a track that is seen in the last map alone would be confirmed by itself."""
+    assert noisy_session.scans == 23
+    replayed(noisy_session, mapper="prob", detect_every=every)
+    assert len(detector.seen) == {23: 2, 22: 3, 5: 6}[every]
+
+
+def test_how_often_is_decided_by_the_cells_that_are_searched(
+    noisy_session: Session, detector: FakeDetector, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """Those of the detector's own map, where it has one: here 220 x 220, where the replay's has 44 x 44."""
+    monkeypatch.setattr("replay.intervals.DETECTED_CELLS", 4 * 220 * 220)
+    viewer = RerunViewer(ViewerOptions(save=tmp_path / "a.rrd"), announce=print)
+    result = replayed(noisy_session, viewer, mapper="prob", resolution=0.05)
+    assert any("detected 4 times along the way" in note for note in result.notes)
+
+
+def test_detections_are_drawn_over_the_map_that_was_searched(
+    noisy_session: Session, detector: FakeDetector, tmp_path: Path
+) -> None:
+    viewer = RerunViewer(ViewerOptions(save=tmp_path / "a.rrd"), announce=print)
+    replayed(noisy_session, viewer, mapper="prob", map_every=10, detect_every=4)
+    rows = rows_of(tmp_path / "a.rrd")
+    maps, found = ({row["scan"] for row in timed(rows[f"/map/{name}"])} for name in ("grid", "detections"))
+    assert found == {0, 3, 7, 11, 15, 19, 22} and maps == found | {10, 20}
+
+
 def test_the_detector_has_a_map_of_its_own_resolution(noisy_session: Session, detector: FakeDetector) -> None:
     result = replayed(noisy_session, mapper="prob", resolution=0.05, detect_every=12)
     assert result.grid.frame.resolution == 0.05

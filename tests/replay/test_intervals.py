@@ -56,3 +56,5 @@ def test_large_maps_are_said_to_be_searched_seldom() -> None:
     assert looks.scans == 234 and "3 times along the way: more often with --detect-every N" in looks.note
     looks = detection_interval(ReplayOptions(), 700, DETECTED_CELLS + 1, is_shown=True)
     assert looks.scans is None and "at the end only" in looks.note
+    single = detection_interval(ReplayOptions(), 700, DETECTED_CELLS, is_shown=True)
+    assert single == looks, "a look after the first scan alone shows nothing"
