@@ -4,7 +4,8 @@ The map of all scans, and fits to all rays, mix the places of a primitive that w
 scans judge what was refined by all of them (:func:`detect.refinement.standing.judge_places`). Where they contradict
 some of it, primitives are detected in a map of the recent scans, too, and refined by these. The first ones count only
 if the older scans contradict them in turn: they were not there before. From then on these are refined by the scans
-since, as long as later scans agree. Where nothing moves, nothing changes.
+since, as long as later scans agree. The error bars of all are widened where the later ones of the scans that they are
+fitted to disagree (:func:`replay.mixed_places.add_disagreement`). Where nothing moves, nothing changes.
 """
 
 from __future__ import annotations
@@ -24,6 +25,7 @@ from prim.metrics import overlap_coefficient
 from prim.scan import Scan
 from prim.se2 import Pose2D
 from prim.threads import cores
+from replay.mixed_places import add_disagreement
 
 Pieces = Sequence[tuple[Scan, Pose2D]]
 """Scans, or their pieces, with the laser's poses."""
@@ -114,14 +116,19 @@ class MovedPrimitives:
         self._moved = tuple(moved for moved in self._moved if not self._stood_always(moved, stands, look))
         if len(stands) == len(found) and not self._moved:
             return look.detections
-        self._moved = self._refine_moved(look, judged, stands, scans, effort)
+        pieces = list(scans())
+        self._moved = self._refine_moved(look, judged, stands, pieces, effort)
         if not self._moved:
             return look.detections
         gone = [judgement.verdict is Verdict.GONE for judgement in judged]
         keeps = [not away and not self._shares(d, self._moved) for d, away in zip(found, gone, strict=True)]
         kept = [d for d, keep in zip(found, keeps, strict=True) if keep]
         dropped = [_rejection(d) for d, keep in zip(found, keeps, strict=True) if not keep]
-        answer = sorted([*kept, *self._moved], key=lambda detection: -detection.score)
+        honest = [
+            add_disagreement(detection, pieces, look.cells, look.noise_std, self._slack)
+            for detection in (*kept, *self._moved)
+        ]
+        answer = sorted(honest, key=lambda detection: -detection.score)
         return replace(
             look.detections, found=tuple(answer), rejected=tuple(_by_score([*look.detections.rejected, *dropped]))
         )
@@ -140,7 +147,7 @@ class MovedPrimitives:
         look: Look,
         judged: Sequence[Judgement],
         stands: Sequence[Detection],
-        scans: Callable[[], Iterable[tuple[Scan, Pose2D]]],
+        scans: Pieces,
         effort: Effort,
     ) -> tuple[Detection, ...]:
         """Return the primitives that moved, each refined by the scans since."""
@@ -152,7 +159,7 @@ class MovedPrimitives:
             effort = replace(effort, warm_start=WarmStart(_since(stands, look.since), look.noise_std))
         effort = replace(effort, since=look.since)
         new = _since(self._without_overlaps([*recent, *nearby], self._moved), look.since).found
-        pieces = list(scans()) if self._moved else look.recent
+        pieces = scans if self._moved else look.recent
         refined = self._refine([*self._moved, *new], look, grid, pieces, effort)
         cells = MapCells.of(grid)
         again = self._judge(refined, look.recent, cells, look.noise_std)

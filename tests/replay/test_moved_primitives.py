@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from concurrent.futures import Future
 from dataclasses import replace
 from itertools import pairwise
@@ -10,10 +11,12 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from detect.detection import Detection
+from detect.detection import Detection, Detections
 from detect.refinement.map_cells import MapCells
 from detect.refinement.rays import collect_rays
+from detect.refinement.refine import Effort, refine_detections
 from detect.refinement.standing import Verdict, judge_places
+from mapping.grid import OccupancyGrid
 from mapping.mapper import make_mapper
 from prim.scan import Scan
 from prim.se2 import Pose2D
@@ -25,6 +28,8 @@ from recorder.session import SessionOptions, record_session
 from recorder.world import WorldOptions
 from replay.detection_refiner import RecentScans
 from replay.detection_stage import DetectionResult
+from replay.mixed_places import add_disagreement
+from replay.moved_primitives import Look, MovedPrimitives
 from replay.options import ReplayOptions
 from replay.pipeline import Pipeline
 from replay.viewing.protocol import NullViewer
@@ -72,6 +77,55 @@ def test_each_primitive_has_the_rays_of_the_scans_since_its_own_stamp() -> None:
 def test_errors_of_poses_are_no_motion() -> None:
     displaced = replace(SQUARE, x=SQUARE.x + 0.03)
     assert verdicts([displaced], scans_of(SQUARE), slack=0.05) == [Verdict.STANDS]
+
+
+def map_of(scans: Sequence[tuple[Scan, Pose2D]]) -> OccupancyGrid:
+    mapper = make_mapper("prob", 0.01, BOUNDS)
+    for scan, pose in scans:
+        mapper.update(scan, pose)
+    return mapper.grid()
+
+
+def fit_to(scans: list[tuple[Scan, Pose2D]], guess: Primitive) -> Detection:
+    wanted = Detections((Detection(guess, 1.0, (0.0, 0.0, 0.0, 0.0), np.zeros((1, 1), np.uint8)),), ())
+    refined, _ = refine_detections(wanted, scans, map_of(scans), NOISE, effort=Effort(max_proposals=0))
+    return refined.found[0]
+
+
+def deviations(detection: Detection, truth: Primitive) -> float:
+    """Return the error of a detection's place in standard deviations."""
+    assert detection.std is not None and detection.covariance is not None
+    assert np.sqrt(np.diag(detection.covariance)) == pytest.approx(list(detection.std.values()))
+    x, y = detection.primitive.x - truth.x, detection.primitive.y - truth.y
+    return max(abs(x) / detection.std["x"], abs(y) / detection.std["y"])
+
+
+def later(scans: list[tuple[Scan, Pose2D]], first: int) -> list[tuple[Scan, Pose2D]]:
+    return [(replace(scan, stamp=first + k), pose) for k, (scan, pose) in enumerate(scans)]
+
+
+def test_later_scans_that_disagree_with_a_fit_widen_its_error_bars() -> None:
+    pushed = replace(SQUARE, x=SQUARE.x + 0.04)
+    mixed = [*scans_of(SQUARE)[:8], *later(scans_of(pushed), 8)]
+    fit = fit_to(mixed, pushed)
+    assert deviations(fit, pushed) > 3
+    assert deviations(add_disagreement(fit, mixed, MapCells.of(map_of(mixed)), NOISE), pushed) < 3
+    alike = [*scans_of(SQUARE), *later(scans_of(SQUARE, seed=1), 12)]
+    fit = fit_to(alike, SQUARE)
+    assert deviations(fit, SQUARE) < 3
+    assert add_disagreement(fit, alike, MapCells.of(map_of(alike)), NOISE) is fit
+
+
+def test_what_was_pushed_within_the_recent_scans_has_error_bars_that_cover_it() -> None:
+    between, end = replace(SQUARE, x=SQUARE.x - 0.1), replace(SQUARE, x=SQUARE.x - 0.14)
+    recent = [*later(scans_of(between)[:8], 12), *later(scans_of(end), 20)]
+    scans = [*scans_of(SQUARE), *recent]
+    grid, before = map_of(scans), fit_to(scans[:12], SQUARE)
+    look = Look(Detections((before,), ()), grid, MapCells.of(grid), NOISE, recent, scans)
+    moved = MovedPrimitives(map_of, lambda _: Detections((), ()), (0.0, 0.0))
+    (found,) = moved.correct(look, lambda: scans, Effort(max_proposals=0)).found
+    assert found.since == 12 and deviations(found, end) < 3
+    assert deviations(fit_to(recent, end), end) > 3
 
 
 def test_recent_scans_are_those_since_the_last_look_and_enough() -> None:
