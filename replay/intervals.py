@@ -14,7 +14,7 @@ MAP_SNAPSHOT_CELLS = 40_000_000
 """By default no more cells than this are shown in all snapshots together: one byte each in a recording."""
 
 DETECTIONS = 10
-"""By default primitives are detected about this many times along the way; set by hand."""
+"""By default primitives are detected about this many times, after the first and the last scan too; set by hand."""
 
 DETECTED_CELLS = 40_000_000
 """By default no more cells than this are searched for primitives in all detections along the way: the time that these
@@ -76,9 +76,10 @@ def detection_interval(options: ReplayOptions, scans: int, cells: int, is_shown:
         return Interval(options.detect_every)
     if not is_shown:
         return NEVER
-    times = min(DETECTIONS, DETECTED_CELLS // cells)
+    most = DETECTIONS - 1  # and the one after the last scan
+    times = min(most, DETECTED_CELLS // cells)
     times = 0 if times < min(2, scans) else times  # a single one, after the first scan, shows nothing
-    if times >= min(DETECTIONS, scans):
+    if times >= min(most, scans):
         return _spread(times, scans)
     often = f"{pluralize(times, 'time')} along the way" if times else "at the end only"
     return _spread(
