@@ -351,11 +351,9 @@ def command_lines(rows: Rows) -> Iterator[str]:
     yield f"| `prim-replay --help` | {middle['help']:.2f} s | {share:.2f} x `import numpy` |"
     yield f"| viewer's share of `prim-replay LOG` | {middle['viewer']:.0%} | – |"
     for mapper in LOOK_MAPPERS:
-        look = " ".join(ONE_LOOK)
-        yield (
-            f"| `prim-replay LOG --mapper {mapper}`, sessions of about 100 scans, beside the same with `{look}` | – | "
-            f"{middle[f'looks {mapper}']:.2f} ({min(rows[f'looks {mapper}']):.2f} to {max(rows[f'looks {mapper}']):.2f}) |"
-        )
+        look, ratios = " ".join(ONE_LOOK), rows[f"looks {mapper}"]
+        what = f"`prim-replay LOG --mapper {mapper}`, sessions of about 100 scans, beside the same with `{look}`"
+        yield f"| {what} | – | {statistics.median(ratios):.2f} ({min(ratios):.2f} to {max(ratios):.2f}) |"
 
 
 def memory_lines(rows: Rows) -> Iterator[str]:

@@ -1,8 +1,8 @@
-"""filterpy's Kalman filter, imported without all of scipy.stats.
+"""filterpy's Kalman filter, imported without what takes most of the time and the tracker does not use.
 
-``filterpy.kalman`` imports ``filterpy.stats``, whose likelihoods need scipy.stats: two thirds of the time that the
-import takes. The tracker asks for no likelihood. While filterpy.kalman is imported, a module stands in for
-``filterpy.stats`` that imports the real one when a likelihood is asked for.
+``filterpy.kalman`` imports ``filterpy.stats``, whose likelihoods need scipy.stats, and ``filterpy.discrete_bayes``,
+which needs scipy.ndimage: three quarters of the time of the import. Meanwhile modules stand in for these two, which
+import the real ones when something of them is asked for.
 """
 
 from __future__ import annotations
@@ -13,31 +13,33 @@ from contextlib import contextmanager
 from types import ModuleType
 from typing import Any
 
-NAME = "filterpy.stats"
+
+class _OnDemand(ModuleType):
+    """A module that is imported when something of it is asked for; until then it stands in for it."""
+
+    def __getattr__(self, attribute: str) -> Any:
+        if attribute.startswith("__") or sys.modules.get(self.__name__) is self:
+            raise AttributeError(f"module {self.__name__!r} has no attribute {attribute!r}")
+        return getattr(__import__(self.__name__, fromlist=[attribute]), attribute)
+
+    def logpdf(self, *arguments: Any, **keywords: Any) -> Any:
+        """See filterpy.stats.logpdf, which filterpy.kalman names when it is imported."""
+        return self.__getattr__("logpdf")(*arguments, **keywords)
 
 
 @contextmanager
-def _statistics_on_demand() -> Iterator[None]:
-    """Let a module stand in for filterpy.stats, unless that is imported already."""
-    if NAME in sys.modules:
-        yield
-        return
-    stand_in = ModuleType(NAME)
-
-    def logpdf(*arguments: Any, **keywords: Any) -> Any:
-        from filterpy.stats import logpdf as likelihood
-
-        return likelihood(*arguments, **keywords)
-
-    stand_in.logpdf = logpdf  # type: ignore[attr-defined]
-    sys.modules[NAME] = stand_in
+def _on_demand(*names: str) -> Iterator[None]:
+    """Let modules be imported on demand by what is imported in a ``with`` block, unless they are imported already."""
+    modules = {name: _OnDemand(name) for name in names if name not in sys.modules}
+    sys.modules.update(modules)
     try:
         yield
     finally:
-        del sys.modules[NAME]
+        for name in modules:
+            del sys.modules[name]
 
 
-with _statistics_on_demand():
+with _on_demand("filterpy.stats", "filterpy.discrete_bayes"):
     from filterpy.kalman import KalmanFilter
 
 __all__ = ["KalmanFilter"]

@@ -294,10 +294,12 @@ def test_the_likelihood_of_filterpy_is_loaded_when_it_is_asked_for() -> None:
     code = "\n".join(
         [
             "import sys, numpy as np; from detect.kalman import KalmanFilter",
-            "assert 'scipy.stats' not in sys.modules",
+            "assert not {'scipy.stats', 'scipy.ndimage'} & {*sys.modules}",
             "f = KalmanFilter(dim_x=1, dim_z=1); f.H = np.eye(1); f.predict(); f.update(np.array([[0.5]]))",
             "print(f.log_likelihood)",
             "from filterpy.stats import logpdf; print(logpdf(f.y, cov=f.S))",
+            "import filterpy; assert filterpy.discrete_bayes.normalize and filterpy.stats.gaussian",
+            "from filterpy.discrete_bayes import normalize",
         ]
     )
     run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=ROOT)
