@@ -120,7 +120,7 @@ def replay(
         typer.Option(
             metavar="N|end",
             help="Detect primitives after the first scan, every N scans and at the end; or at the end only. "
-            "[default: about 10 times; without a viewer, end]",
+            "[default: 8 times; without a viewer, end]",
         ),
     ] = None,
     no_refine: Annotated[

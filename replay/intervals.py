@@ -13,8 +13,9 @@ MAP_SNAPSHOTS = 50
 MAP_SNAPSHOT_CELLS = 40_000_000
 """By default no more cells than this are shown in all snapshots together: one byte each in a recording."""
 
-DETECTIONS = 10
-"""By default primitives are detected about this many times, after the first and the last scan too; set by hand."""
+DETECTIONS = 8
+"""By default primitives are detected so many times at most, after the first and the last scan too. Set by hand, so that
+it takes at most 40 % more time than one detection at the end (`python -m bench.speed`)."""
 
 DETECTED_CELLS = 40_000_000
 """By default no more cells than this are searched for primitives in all detections along the way: the time that these

@@ -53,7 +53,7 @@ class ReplayOptions:
             the interval.
         detect: Whether primitives are detected.
         detect_every: N to detect primitives after the first scan, after every N scans, and at the end; «end» for the
-            end only; None for about ten times where the replay is shown, else the end only.
+            end only; None for eight times where the replay is shown, else the end only.
         refine: Whether detections are refined with the rays.
         weights: The weights of the detector; None for those that come with prim.
         recover: Whether what is left of a damaged log is read.

@@ -173,7 +173,7 @@ def test_several_mappers_share_a_recording(comparison: tuple[Path, dict[str, Rep
         scores = value(timed(rows[f"/{mapper}/scores"])[-1], "scalars")
         assert scores[0] == pytest.approx(result.scores.occupied_f1)
         f1 = [value(row, "scalars")[0] for row in timed(rows[f"/{mapper}/errors/found"])]
-        assert f1[-1] == pytest.approx(result.detections.errors.f1) and len(f1) > 8
+        assert f1[-1] == pytest.approx(result.detections.errors.f1) and len(f1) >= 6
         assert len(timed(rows[f"/{mapper}/timing"])) == result.scans
     assert len(timed(rows["/map/scan"])) == next(iter(results.values())).scans
     assert "/map/grid" not in rows
@@ -185,7 +185,7 @@ def test_errors_and_maps_are_there_from_the_first_scan_on(recording: tuple[Path,
     path, result = recording
     rows = rows_of(path)
     looks = sorted({row["scan"] for row in timed(rows["/errors/found"])})
-    assert looks[0] == 0 and looks[-1] == result.scans - 1 and 8 <= len(looks) <= 12
+    assert looks[0] == 0 and looks[-1] == result.scans - 1 and 6 <= len(looks) <= 8
     assert timed(rows["/scores"])[0]["scan"] == 0 and timed(rows["/detections"])[0]["scan"] == 0
 
 
