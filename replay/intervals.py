@@ -14,8 +14,8 @@ MAP_SNAPSHOT_CELLS = 40_000_000
 """By default no more cells than this are shown in all snapshots together: one byte each in a recording."""
 
 DETECTIONS = 8
-"""By default primitives are detected so many times at most, after the first and the last scan too. Set by hand, so that
-it takes at most 40 % more time than one detection at the end (`python -m bench.speed`)."""
+"""By default primitives are detected so many times at most, after the first and the last scan too. Set by hand: a
+replay takes at most 40 % more time than with one detection at the end (`python -m bench.speed`)."""
 
 DETECTED_CELLS = 40_000_000
 """By default no more cells than this are searched for primitives in all detections along the way: the time that these
