@@ -29,7 +29,7 @@ from bench.maps import update
 from prim.metrics import match_primitives
 from recorder.sensors import Lidar
 from recorder.session import SessionOptions, record_session
-from replay.detection_stage import DetectionResult, TrackIdentity
+from replay.detection.stage import DetectionResult, TrackIdentity
 from replay.options import ReplayOptions
 from replay.pipeline import Pipeline
 from replay.viewing.protocol import NullViewer

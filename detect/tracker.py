@@ -20,7 +20,7 @@ Track management, counted in updates (one for each time that the detector runs o
 - a confirmed one is deleted after ``delete_after`` consecutive updates without a detection.
 
 Importing filterpy takes some tenths of a second: what makes tracks imports this module in a thread
-(replay.detection_stage).
+(replay.detection.stage).
 """
 
 from __future__ import annotations

@@ -77,7 +77,7 @@ SCAN = (
 DETECTION = (
     Stage(
         "Detect where it is due: cut tiles",
-        (("replay/detection_stage.py", "DetectionStage"), ("detect/networks/tiles.py", "tile_image")),
+        (("replay/detection/stage.py", "DetectionStage"), ("detect/networks/tiles.py", "tile_image")),
         "images of 224 × 224 cells",
     ),
     Stage(
@@ -92,22 +92,22 @@ DETECTION = (
     ),
     Stage(
         "Fit them to the rays, compare the kinds",
-        (("replay/detection_refiner.py", "DetectionRefiner"), ("detect/refinement/refine.py", "refine_detections")),
+        (("replay/detection/refiner.py", "DetectionRefiner"), ("detect/refinement/refine.py", "refine_detections")),
         "Detections with std and chances",
     ),
     Stage(
         "Follow them over time",
-        (("detect/tracker.py", "Tracker"), ("replay/detection_stage.py", "TrackIdentity")),
+        (("detect/tracker.py", "Tracker"), ("replay/detection/stage.py", "TrackIdentity")),
         "persistent ids",
     ),
     Stage(
         "Compare with the true primitives",
-        (("prim/metrics.py", "detection_errors"), ("replay/detection_stage.py", "DetectionResult")),
+        (("prim/metrics.py", "detection_errors"), ("replay/detection/stage.py", "DetectionResult")),
         "DetectionResult",
     ),
     Stage(
         "Report",
-        (("replay/result.py", "ReplayResult"), ("replay/report.py", "report_json")),
+        (("replay/result.py", "ReplayResult"), ("replay/outputs/report.py", "report_json")),
         "LOG.MAPPER.report.json",
     ),
 )

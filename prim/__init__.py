@@ -22,8 +22,8 @@ if TYPE_CHECKING:
     from prim.world import World
     from recorder.api import record
     from replay.api import LaserTrajectory, Result, make_mapper, open_log, posed_scans, refine, replay, replay_each
-    from replay.found_primitives import FoundPrimitive
-    from replay.picture import Picture
+    from replay.outputs.found_primitives import FoundPrimitive
+    from replay.outputs.picture import Picture
 
 __version__ = "0.2.0"
 
@@ -56,13 +56,13 @@ __all__ = [
 _, __getattr__, __dir__ = lazy_exports(
     __name__,
     {
-        "FoundPrimitive": "replay.found_primitives",
+        "FoundPrimitive": "replay.outputs.found_primitives",
         "GridFrame": "mapping.grid",
         "Kind": "prim.shapes",
         "LogReadError": "prim.errors",
         "OccupancyGrid": "mapping.grid",
         "OutputError": "prim.errors",
-        "Picture": "replay.picture",
+        "Picture": "replay.outputs.picture",
         "Pose2D": "prim.se2",
         "PrimError": "prim.errors",
         "Primitive": "prim.shapes",

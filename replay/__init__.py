@@ -8,8 +8,8 @@ __all__, __getattr__, __dir__ = lazy_exports(
         "replay_options": "replay.keywords",
         "ReplayOptions": "replay.options",
         "Pipeline": "replay.pipeline",
-        "report_json": "replay.report",
-        "summary_rows": "replay.report",
+        "report_json": "replay.outputs.report",
+        "summary_rows": "replay.outputs.report",
         "ReplayResult": "replay.result",
     },
 )

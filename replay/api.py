@@ -28,15 +28,15 @@ from prim.se2 import Pose2D
 from prim.shapes import Primitive
 from prim.threads import cores
 from prim.world import Bounds
-from replay.exports import check_distinct, log_stem, write_map, write_report, write_trajectory
-from replay.found_primitives import FoundPrimitive, found_primitives
 from replay.keywords import PARAMETERS, SWITCHES, ReplayKeywords, replay_options
 from replay.localization import localize, pose_scans
 from replay.notes import pluralize
 from replay.options import ReplayOptions
+from replay.outputs.exports import check_distinct, log_stem, write_map, write_report, write_trajectory
+from replay.outputs.found_primitives import FoundPrimitive, found_primitives
+from replay.outputs.report import report_json
 from replay.pipeline import Pipeline
 from replay.posed_scans import ScanLog
-from replay.report import report_json
 from replay.result import ReplayResult
 from replay.timing import StageTimer
 from replay.viewing.protocol import Viewer, ViewerOptions
@@ -44,7 +44,7 @@ from replay.viewing.protocol import Viewer, ViewerOptions
 if TYPE_CHECKING:
     import pyarrow as pa
 
-    from replay.picture import Picture
+    from replay.outputs.picture import Picture
 
 
 @dataclass(frozen=True)
@@ -99,14 +99,14 @@ class Result:
         return f"Result({found} in {cols} x {rows} cells of {mapper}, {scans}, poses: {source})"
 
     def table(self) -> pa.Table:
-        """Return the primitives as a table, a row for each; see :func:`replay.tables.primitives_table`."""
-        from replay.tables import primitives_table
+        """Return the primitives as a table, a row for each; see :func:`replay.outputs.tables.primitives_table`."""
+        from replay.outputs.tables import primitives_table
 
         return primitives_table(self.primitives)
 
     def plot(self) -> Picture:
         """Draw the map, the primitives, and in grey the true ones, where they are known."""
-        from replay.picture import draw_picture
+        from replay.outputs.picture import draw_picture
 
         return draw_picture(self.grid, self.primitives, self.truth)
 

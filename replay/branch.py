@@ -7,7 +7,7 @@ from typing import NamedTuple
 from mapping.grid import GridFrame, OccupancyGrid
 from mapping.map_metrics import MapScores
 from prim.scan import PosedScan
-from replay.detection_stage import DetectionResult, DetectionStage, make_detection_stage
+from replay.detection.stage import DetectionResult, DetectionStage, make_detection_stage
 from replay.intervals import NEVER, snapshot_interval
 from replay.mapping_stage import MappingStage, Usage, make_replay_mapper
 from replay.options import ReplayOptions

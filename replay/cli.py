@@ -229,7 +229,7 @@ class OutputFiles:
         Returns:
             The files of this log.
         """
-        from replay.exports import log_stem
+        from replay.outputs.exports import log_stem
 
         stem = log_stem(log)
         name = f"{stem}.{'-'.join(mappers)}.rrd"
@@ -249,7 +249,7 @@ class OutputFiles:
         Returns:
             The files, of which all mappers share the recording and the trajectory.
         """
-        from replay.exports import map_stem
+        from replay.outputs.exports import map_stem
 
         if len(mappers) == 1:
             return self
@@ -259,7 +259,7 @@ class OutputFiles:
 
     def paths(self, mappers: Sequence[str]) -> list[Path]:
         """Return the paths of all files of some mappers."""
-        from replay.exports import map_files
+        from replay.outputs.exports import map_files
 
         of_each = [self.of_mapper(mapper, mappers) for mapper in mappers]
         maps = [path for files in of_each if files.map for path in map_files(files.map)]
@@ -290,7 +290,7 @@ def _replay_logs(
     verbosity: Verbosity,
 ) -> int:
     """Replay logs one after the other; return the exit code of the worst."""
-    from replay.exports import check_distinct
+    from replay.outputs.exports import check_distinct
 
     with_recording = viewer is not None and not viewer.watched
     jobs = {log: files.named_after(log, options.mappers, with_recording) for log in logs}
@@ -311,7 +311,7 @@ def _replay_log(
     log: Path, options: ReplayOptions, outputs: OutputFiles, shown: ViewerOptions | None, verbosity: Verbosity
 ) -> int:
     """Replay one log, write its outputs and print its table; return the exit code."""
-    from replay.exports import check_writable
+    from replay.outputs.exports import check_writable
     from replay.pipeline import Pipeline
 
     for path in outputs.paths(options.mappers):
@@ -339,7 +339,7 @@ def _make_viewer(shown: ViewerOptions | None) -> Viewer | None:
 
 def _write_outputs(result: ReplayResult, outputs: OutputFiles) -> None:
     """Write the report, the map and the trajectory, where they are wanted."""
-    from replay.exports import write_map, write_report, write_trajectory
+    from replay.outputs.exports import write_map, write_report, write_trajectory
 
     if outputs.report:
         write_report(outputs.report, result)
@@ -375,7 +375,7 @@ def _print_rejected(result: ReplayResult) -> None:
 
 def _print_tables(results: Sequence[ReplayResult], verbose: bool) -> None:
     """Print the table of one mapper's result, or how several compare; with the time of each stage if verbose."""
-    from replay.report import comparison_table, shared_rows, summary_rows
+    from replay.outputs.report import comparison_table, shared_rows, summary_rows
 
     several = len(results) > 1
     _print_table(shared_rows(results) if several else summary_rows(results[0]))

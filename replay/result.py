@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from mapping.grid import OccupancyGrid
 from mapping.map_metrics import MapScores
-from replay.detection_stage import DetectionResult
+from replay.detection.stage import DetectionResult
 from replay.options import ReplayOptions
 from replay.poses.laser_poses import LaserPoses
 

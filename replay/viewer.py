@@ -18,7 +18,7 @@ from prim.errors import PrimError
 from prim.metrics import DetectionErrors
 from prim.scan import PosedScan
 from prim.world import World
-from replay.detection_stage import DetectionResult
+from replay.detection.stage import DetectionResult
 from replay.result import ReplayResult
 from replay.viewer_layout import (
     ANGLE_ERROR,

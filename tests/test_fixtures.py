@@ -11,8 +11,8 @@ from prim.log import open_log
 from prim.log.messages import SCAN_TOPIC, decode_scan
 from replay.ground_truth import GroundTruth
 from replay.keywords import replay_options
+from replay.outputs.report import report_json
 from replay.pipeline import Pipeline
-from replay.report import report_json
 
 FIXTURES = Path(__file__).parent / "fixtures"
 LOGS = sorted(FIXTURES.glob("*/*.mcap"))

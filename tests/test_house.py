@@ -35,10 +35,16 @@ ARROWS: dict[str, set[str]] = {
         "detect/training",
     },
     "replay/poses": {"prim", "prim/log", "mapping", "mapping/forward"},
-    "replay/viewing": {"prim", "mapping", "detect", "replay", "replay/poses"},
+    "replay/detection": {
+        "prim", "mapping", "detect", "detect/networks", "detect/refinement", "replay", "replay/poses",
+    },
+    "replay/outputs": {"prim", "mapping", "detect", "replay", "replay/detection", "replay/poses"},
+    "replay/viewing": {
+        "prim", "mapping", "detect", "replay", "replay/detection", "replay/outputs", "replay/poses",
+    },
     "replay": {
         "prim", "prim/log", "mapping", "mapping/forward", "detect", "detect/networks", "detect/refinement",
-        "replay/poses", "replay/viewing",
+        "replay/detection", "replay/outputs", "replay/poses", "replay/viewing",
     },
 }  # fmt: skip
 """For each folder the folders that its files may import from, beside itself."""
@@ -52,7 +58,11 @@ NARROW = {
 
 ENDS = {
     ("detect/refinement", "detect"): {"detection"},
-    ("replay/viewing", "replay"): {"result", "report", "detection_stage"},
+    ("replay/viewing", "replay"): {"result"},
+    ("replay/viewing", "replay/outputs"): {"report"},
+    ("replay/viewing", "replay/detection"): {"stage"},
+    ("replay/outputs", "replay"): {"result", "notes"},
+    ("replay/detection", "replay"): {"ground_truth", "intervals", "options", "posed_scans", "timing"},
 }
 """Arrows that lead to these files of a folder alone."""
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 
-from replay.detection_stage import DetectionResult
-from replay.report import comparison_table, shared_rows, summary_rows
+from replay.detection.stage import DetectionResult
+from replay.outputs.report import comparison_table, shared_rows, summary_rows
 from replay.result import ReplayResult
 
 

@@ -14,7 +14,7 @@ from prim.scan import PosedScan
 from prim.world import Bounds, World
 
 if TYPE_CHECKING:
-    from replay.detection_stage import DetectionResult
+    from replay.detection.stage import DetectionResult
     from replay.result import ReplayResult
 
 

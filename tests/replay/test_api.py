@@ -18,8 +18,8 @@ from replay import cli
 from replay.api import Result
 from replay.keywords import SWITCHES, ReplayKeywords
 from replay.options import ReplayOptions
+from replay.outputs.report import comparison_table, shared_rows
 from replay.pipeline import Pipeline
-from replay.report import comparison_table, shared_rows
 from replay.result import distinct_notes
 
 

@@ -13,7 +13,7 @@ from prim.log import open_log
 from prim.scan import PosedScan, Scan
 from prim.se2 import Pose2D
 from recorder.session import Session
-from replay.detection_refiner import ScanSubset
+from replay.detection.refiner import ScanSubset
 from replay.posed_scans import PosedScanOptions, PosedScans, ScanLog
 from replay.poses.pose_provider import PoseProvider
 from replay.selection import Selection

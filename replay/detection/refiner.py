@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from detect.detection import Detection, Detections
     from detect.refinement.map_cells import MapCells
     from detect.refinement.refine import Effort
-    from replay.moved_primitives import MovedPrimitives
+    from replay.detection.moved_primitives import MovedPrimitives
 
 
 @dataclass(frozen=True)
@@ -230,7 +230,7 @@ class DetectionRefiner:
         recent = self._recent.pieces()
         if self._moved is None or noise_std is None or not recent:
             return detections
-        from replay.moved_primitives import Look
+        from replay.detection.moved_primitives import Look
 
         return self._moved.correct(
             Look(detections, grid, cells, noise_std, recent, self._scans.pieces()), scans, effort

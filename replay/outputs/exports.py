@@ -13,7 +13,7 @@ import numpy as np
 
 from mapping.grid import OccupancyGrid
 from prim.errors import OutputError, UsageError
-from replay.report import report_json
+from replay.outputs.report import report_json
 from replay.result import ReplayResult
 
 FREE_THRESHOLD, OCCUPIED_THRESHOLD = 0.196, 0.65

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import pyarrow as pa
 
 from prim.shapes import Kind
-from replay.found_primitives import FoundPrimitive
+from replay.outputs.found_primitives import FoundPrimitive
 
 POSE = ("x", "y", "theta")
 

@@ -15,7 +15,7 @@ from prim.arrays import FloatArray
 from prim.errors import OutputError, UsageError
 from prim.parameters import checked_path
 from prim.shapes import Primitive
-from replay.found_primitives import FoundPrimitive
+from replay.outputs.found_primitives import FoundPrimitive
 
 LONGER_SIDE = 1000
 """About how many pixels the longer side of a picture has; set by hand."""

@@ -20,7 +20,7 @@ from prim.scan import PosedScan, Scan
 from prim.se2 import Pose2D
 from prim.shapes import Primitive
 from prim.threads import preload
-from replay.detection_refiner import DetectionRefiner
+from replay.detection.refiner import DetectionRefiner
 from replay.ground_truth import GroundTruth
 from replay.intervals import detection_interval, is_due
 from replay.options import ReplayOptions
@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from detect.detection import Detections
     from detect.detector import Detector
     from detect.tracker import Tracker
-    from replay.moved_primitives import MovedPrimitives
+    from replay.detection.moved_primitives import MovedPrimitives
 
 
 @dataclass(frozen=True)
@@ -275,7 +275,7 @@ def _moved_primitives(
     detector: Detector, options: ReplayOptions, frame: GridFrame, pose_std: tuple[float, float]
 ) -> MovedPrimitives:
     """Make the part that refines what moves, with maps as the networks were trained on."""
-    from replay.moved_primitives import MovedPrimitives  # as all that refinement needs
+    from replay.detection.moved_primitives import MovedPrimitives  # as all that refinement needs
 
     def make_map(scans: Iterable[tuple[Scan, Pose2D]]) -> OccupancyGrid:
         mapper = _detectors_mapper(detector, options, frame)

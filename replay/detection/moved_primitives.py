@@ -5,7 +5,7 @@ scans judge what was refined by all of them (:func:`detect.refinement.standing.j
 some of it, primitives are detected in a map of the recent scans, too, and refined by these. The first ones count only
 if the older scans contradict them in turn: they were not there before. From then on these are refined by the scans
 since, as long as later scans agree. The error bars of all are widened where the later ones of the scans that they are
-fitted to disagree (:func:`replay.mixed_places.add_disagreement`). Where nothing moves, nothing changes.
+fitted to disagree (:func:`replay.detection.mixed_places.add_disagreement`). Where nothing moves, nothing changes.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from prim.metrics import overlap_coefficient
 from prim.scan import Scan
 from prim.se2 import Pose2D
 from prim.threads import cores
-from replay.mixed_places import add_disagreement
+from replay.detection.mixed_places import add_disagreement
 
 Pieces = Sequence[tuple[Scan, Pose2D]]
 """Scans, or their pieces, with the laser's poses."""

@@ -19,10 +19,10 @@ from prim.errors import UsageError
 from prim.shapes import Kind, Primitive
 from recorder.session import Session
 from replay import cli
-from replay.detection_refiner import add_frame_uncertainty
+from replay.detection.refiner import add_frame_uncertainty
 from replay.options import ReplayOptions
+from replay.outputs.report import report_json, summary_rows
 from replay.pipeline import Pipeline
-from replay.report import report_json, summary_rows
 from replay.result import ReplayResult
 from replay.viewer import RerunViewer
 from replay.viewing.protocol import ViewerOptions
@@ -215,7 +215,7 @@ def test_a_map_too_large_for_the_detector_skips_detection(
 ) -> None:
     """The map itself is small enough: the replay goes on, and the table gives the reason."""
     monkeypatch.setattr("mapping.grid.MAX_CELLS", 10_000)
-    monkeypatch.setattr("replay.detection_stage.shipped_weights", lambda mapper: Path("w"))
+    monkeypatch.setattr("replay.detection.stage.shipped_weights", lambda mapper: Path("w"))
     result = Pipeline(noisy_session.path, ReplayOptions(resolution=0.05)).run()
     assert dict(summary_rows(result))["primitives"].startswith("detection skipped: a map of")
 

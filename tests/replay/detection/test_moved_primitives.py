@@ -26,10 +26,10 @@ from prim.world import World
 from recorder.sensors import Lidar
 from recorder.session import SessionOptions, record_session
 from recorder.world import WorldOptions
-from replay.detection_refiner import RecentScans
-from replay.detection_stage import DetectionResult
-from replay.mixed_places import add_disagreement
-from replay.moved_primitives import Look, MovedPrimitives
+from replay.detection.mixed_places import add_disagreement
+from replay.detection.moved_primitives import Look, MovedPrimitives
+from replay.detection.refiner import RecentScans
+from replay.detection.stage import DetectionResult
 from replay.options import ReplayOptions
 from replay.pipeline import Pipeline
 from replay.viewing.protocol import NullViewer

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from prim.shapes import Kind, Primitive
-from replay.detection_stage import DetectionResult
+from replay.detection.stage import DetectionResult
 
 if TYPE_CHECKING:
     from detect.detection import Detection

@@ -12,9 +12,9 @@ from mapping.grid import OccupancyGrid
 from mapping.map_metrics import MapScores
 from prim.metrics import DetectionErrors
 from prim.shapes import Kind
-from replay.detection_stage import DetectionResult
-from replay.found_primitives import found_primitives
+from replay.detection.stage import DetectionResult
 from replay.notes import pluralize
+from replay.outputs.found_primitives import found_primitives
 from replay.poses.fusion_options import COMPASS, GPS, ODOM
 from replay.poses.laser_poses import FusedSensor, LaserPoses
 from replay.result import ReplayResult
