@@ -31,7 +31,7 @@ class IntermediateOptions:
         kind_search_growth: Kinds of primitives whose kind was certain are compared again once the number of scans has
             grown by this factor since they were last.
         proposals: At most this many connected components of the map that the networks missed are tried.
-        recent_scans: What moved is looked for in the scans since the last look, but in so many at least.
+        recent_scans: What moved is searched in the scans since the last look, but in so many at least.
         proposals_from: None are tried before this many scans: maps of few scans are full of fragments.
     """
 
