@@ -1,17 +1,22 @@
-"""What all commands of prim share: errors as one line without a traceback, exit codes, the progress bar."""
+"""What all commands of prim share: text on the terminal, errors as one line, exit codes, the progress bar."""
 
 from __future__ import annotations
 
 import gc
+import io
 import os
 import sys
 import traceback
+import warnings
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
+from typing import TextIO
 
 import typer
 
-from prim.errors import PrimError
+from prim.errors import PrimError, UsageError
+from prim.interrupts import Interrupts
+from prim.text import printable
 
 USAGE = 2
 FAILED = 1
@@ -22,32 +27,136 @@ def run(app: typer.Typer, name: str, arguments: Sequence[str]) -> int:
     """Run a command line.
 
     Args:
-        app: The command.
+        app: The command; its context's ``obj`` are the :class:`prim.interrupts.Interrupts` of this run.
         name: Its name, as error messages begin with it.
         arguments: Its arguments.
 
     Returns:
-        The exit code. 0: done; 1: an input that cannot be used, or a bug; 2: usage; 3: done, but part of a log was
-        lost; 130: interrupted.
+        The exit code. 0: done; 1: an input that cannot be used, an output that cannot be written, or a bug; 2: usage;
+        3: done, but part of a log was lost; 130: interrupted; 143: terminated.
     """
     debug = "--debug" in arguments
     gc.set_threshold(100_000, 50, 50)  # imports make many objects that stay: collecting among them takes 0.4 s
+    _prepare_streams()
+    with warnings.catch_warnings(), Interrupts() as interrupts:
+        if not sys.warnoptions:
+            warnings.simplefilter("ignore")  # numpy's quote lines of source code; what matters is a note or an error
+        try:
+            code = _run(app, name, arguments, interrupts, debug)
+            sys.stdout.flush()
+        except KeyboardInterrupt:
+            code = _print_line(name, "interrupted", interrupts.exit_code or INTERRUPTED)
+        except BrokenPipeError:
+            code = _ignore_output()
+        except OSError as error:
+            _ignore_output()
+            code = _print_line(name, f"cannot write to stdout: {error.strerror}", FAILED)
+    return code
+
+
+def _run(app: typer.Typer, name: str, arguments: Sequence[str], interrupts: Interrupts, debug: bool) -> int:
+    """Run a command; print its error, if there is one, as one line."""
     try:
-        code = typer.main.get_command(app)(list(arguments), prog_name=name, standalone_mode=False)
-        return _print_line(name, "interrupted", INTERRUPTED) if code == INTERRUPTED else int(code or 0)
+        _check_working_folder()
+        command = typer.main.get_command(app)
+        code = command(list(arguments), prog_name=name, standalone_mode=False, obj=interrupts)
+        if code == INTERRUPTED:  # what typer makes of a KeyboardInterrupt
+            return _print_line(name, "interrupted", interrupts.exit_code or INTERRUPTED)
+        return int(code or 0)
     except typer.TyperException as error:
         what = error.format_message().replace("Value error, ", "")
         return _print_line(name, f"{what} (try: {name} --help)", USAGE)
     except PrimError as error:
         return print_error(name, error, debug)
     except BrokenPipeError:
-        sys.stdout = open(os.devnull, "w", encoding="utf-8")  # noqa: PTH123, SIM115 - the reader has gone
-        return 0
+        raise
     except Exception as error:
         if debug:
-            traceback.print_exc()
-        what = f"unexpected {type(error).__name__}: {error}"
-        return _print_line(name, f"{what} (this is a bug: --debug shows the traceback)", FAILED)
+            _print_traceback(error)
+        return _print_line(name, _describe(error), FAILED)
+
+
+def _describe(error: Exception) -> str:
+    """Describe an error that no part of prim expects: what the system refuses, or a bug."""
+    if isinstance(error, OSError) and error.strerror:
+        where = f"{error.filename}: " if error.filename else ""
+        return f"{where}{error.strerror} (--debug shows the traceback)"
+    if isinstance(error, MemoryError):
+        return "out of memory: a larger --resolution or a part of the log takes less (--debug shows the traceback)"
+    return f"unexpected {type(error).__name__}: {error} (this is a bug: --debug shows the traceback)"
+
+
+def _check_working_folder() -> None:
+    """Raise UsageError where the working folder was deleted: no path can be resolved there."""
+    try:
+        os.getcwd()  # noqa: PTH109 - Path.cwd() would do the same
+    except OSError:
+        raise UsageError("the working folder does not exist any more: change to another one") from None
+
+
+def _prepare_streams() -> None:
+    """Open the standard streams that are closed, and let them take text that their encoding does not have.
+
+    Else the first file that is opened would get a closed stream's number, and what is printed would go there.
+    """
+    for number, name in enumerate(("stdin", "stdout", "stderr")):
+        stream = getattr(sys, name)
+        if stream is None:
+            descriptor = os.open(os.devnull, os.O_RDWR)
+            if descriptor != number:
+                os.dup2(descriptor, number)
+            setattr(sys, name, os.fdopen(number, "w" if number else "r", encoding="utf-8"))
+        elif isinstance(stream, io.TextIOWrapper) and number:
+            stream.reconfigure(errors="backslashreplace")
+
+
+def _ignore_output() -> int:
+    """Drop what is still to be printed: nobody reads it, or it has no place."""
+    with suppress(OSError):
+        sys.stdout.close()
+    sys.stdout = open(os.devnull, "w", encoding="utf-8")  # noqa: PTH123, SIM115 - to the end of the process
+    return 0
+
+
+def echo(line: str, err: bool = False) -> None:
+    """Print a line; what a terminal would obey in it is made visible, see :func:`prim.text.printable`.
+
+    Args:
+        line: The line.
+        err: Print it on stderr.
+    """
+    _print(printable(line), sys.stderr if err else sys.stdout)
+
+
+def _print(text: str, stream: TextIO) -> None:
+    """Print text; nothing is said where the reader of stdout has gone."""
+    try:
+        print(text, file=stream)
+    except BrokenPipeError:
+        _ignore_output()
+
+
+def print_table(rows: Sequence[Sequence[str]], header: Sequence[str] = ()) -> None:
+    """Print rows of cells.
+
+    Args:
+        rows: The rows.
+        header: Names of the columns, which may have several lines; under one, all but the first column hold numbers
+            and stand at the right.
+    """
+    from rich.console import Console
+    from rich.table import Table
+    from rich.text import Text
+
+    table = Table(show_header=bool(header), box=None, pad_edge=False)
+    for name in header:
+        table.add_column(name, justify="left" if name == header[0] else "right")
+    for row in rows:
+        table.add_row(*(Text(printable(cell)) for cell in row))
+    console = Console(highlight=False, soft_wrap=True)
+    with console.capture() as captured:
+        console.print(table)
+    _print(captured.get().rstrip("\n"), sys.stdout)
 
 
 def print_error(name: str, error: PrimError, debug: bool = False) -> int:
@@ -62,8 +171,13 @@ def print_error(name: str, error: PrimError, debug: bool = False) -> int:
         The exit code that goes with it.
     """
     if debug:
-        traceback.print_exception(error)
+        _print_traceback(error)
     return _print_line(name, str(error), error.exit_code)
+
+
+def _print_traceback(error: BaseException) -> None:
+    for line in "".join(traceback.format_exception(error)).splitlines():
+        echo(line, err=True)
 
 
 @contextmanager
@@ -91,6 +205,5 @@ def progress_bar(label: str, quiet: bool) -> Iterator[Callable[[int, int], None]
 
 
 def _print_line(name: str, what: str, code: int) -> int:
-    line = " ".join(what.split())
-    print(f"{name}: error: {line}", file=sys.stderr)
+    echo(f"{name}: error: {' '.join(what.split())}", err=True)
     return code

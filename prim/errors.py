@@ -9,7 +9,7 @@ class PrimError(Exception):
     """Base of all expected errors; the message is one line: what is wrong, where, and what to do.
 
     Attributes:
-        exit_code: What a command exits with: 2 for usage, 130 for an interruption (128 + SIGINT), else 1.
+        exit_code: What a command exits with: 2 for usage, 128 + the signal for an interruption, else 1.
     """
 
     exit_code = 1
@@ -45,10 +45,17 @@ class OutputError(PrimError):
         super().__init__(f"{path}: cannot write: {cause.strerror or cause}; choose another place")
 
 
-class InterruptedRecordingError(PrimError):
-    """A recording that was interrupted; the message names the file that holds the recorded part."""
+class InterruptedRunError(PrimError):
+    """A recording or a replay that was interrupted; the message says what is left of it.
 
-    exit_code = 130
+    Args:
+        message: The message.
+        exit_code: 128 and the number of the signal.
+    """
+
+    def __init__(self, message: str, exit_code: int = 130) -> None:
+        super().__init__(message)
+        self.exit_code = exit_code
 
 
 class WorldError(PrimError):

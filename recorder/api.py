@@ -10,11 +10,12 @@ from recorder.keywords import PARAMETERS, SWITCHES, RecordingKeywords, recording
 from recorder.session import Session, record_session
 
 
-def record(path: str | Path, **options: Unpack[RecordingKeywords]) -> Session:
+def record(path: str | Path, *, force: bool = False, **options: Unpack[RecordingKeywords]) -> Session:
     """Record a simulated session of a robot with a 2D LiDAR to an MCAP log.
 
     Args:
         path: The log to write.
+        force: Whether a file in its place may be replaced that is no earlier recording.
         **options: The options of ``prim-record``, see :class:`recorder.keywords.RecordingKeywords`; angles are
             radians.
 
@@ -22,10 +23,11 @@ def record(path: str | Path, **options: Unpack[RecordingKeywords]) -> Session:
         What was recorded: ``world``, ``scans``, ``duration`` …
 
     Raises:
-        UsageError: A parameter is impossible, or two exclude each other.
+        UsageError: A parameter is impossible, two exclude each other, or there is another file in the log's place.
         WorldError: The file of the world is no world.
         OutputError: The log cannot be written.
     """
-    with errors_name_parameters(PARAMETERS, SWITCHES):
+    with errors_name_parameters(PARAMETERS, {*SWITCHES, "force"}):
         output = checked_path("path", path)
-        return record_session(output, recording_options(**checked_keywords(RecordingKeywords, options)))
+        chosen = recording_options(**checked_keywords(RecordingKeywords, options, ("force",)))
+        return record_session(output, chosen, force)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import shlex
 import sys
 from collections import Counter
 from enum import StrEnum
@@ -42,6 +43,7 @@ def _show_version(wanted: bool) -> None:
 
 @app.command()
 def record(
+    context: typer.Context,
     output: Annotated[Path, typer.Argument(metavar="OUT.mcap", help="The log to write.")],
     seed: Annotated[
         int, typer.Option(metavar="N", min=0, help="The same seed and options write the same bytes.")
@@ -94,6 +96,9 @@ def record(
     ] = None,
     gps_noise: Annotated[float, typer.Option(metavar="M", help="GPS noise (std), metres.")] = 0.1,
     compass_noise: Annotated[float, typer.Option(metavar="DEG", help="Compass noise (std), degrees.")] = 3.0,
+    force: Annotated[
+        bool, typer.Option("--force", help="Replace OUT.mcap even if it is no log of prim-record.")
+    ] = False,
     quiet: Annotated[bool, typer.Option("--quiet", help="Print nothing.")] = False,
     debug: Annotated[bool, typer.Option("--debug", help="Show tracebacks.")] = False,
     version: Annotated[
@@ -127,9 +132,13 @@ def record(
         gps_noise=gps_noise,
         compass_noise=math.radians(compass_noise),
     )
-    session = record_session(output, options)
+    replaces = output.exists()
+    session = record_session(output, options, force, context.obj)
     if not quiet:
-        typer.echo(_summary(session, options))
+        console.echo(_summary(session, options))
+        if replaces:
+            console.echo("replaced the earlier file of that name")
+        console.echo(f"replay it: prim-replay {shlex.quote(str(session.path))}")
     return 0
 
 
@@ -155,7 +164,7 @@ def _summary(session: Session, options: SessionOptions) -> str:
     skipped = f" ({session.skipped} stops skipped: something stands there)" if session.skipped else ""
     return (
         f"{session.path}: {session.scans} scans of {options.lidar.rays} rays{skipped}, "
-        f"noise {options.lidar.noise_std * MM_PER_M:g} mm, {what}\nreplay it: prim-replay {session.path}"
+        f"noise {options.lidar.noise_std * MM_PER_M:g} mm, {what}"
     )
 
 

@@ -12,6 +12,8 @@ import numpy as np
 
 from prim import __version__
 from prim.errors import UsageError
+from prim.files import check_no_input, check_output
+from prim.interrupts import Interrupts
 from prim.log.messages import (
     BASE_FRAME,
     COMPASS_TOPIC,
@@ -39,7 +41,7 @@ from prim.log.messages import (
     encode_scan,
     encode_transforms,
 )
-from prim.log.writer import LogWriter
+from prim.log.writer import RECORDED_LOG, LogWriter
 from prim.se2 import Pose2D
 from prim.world import World
 from recorder.motion import ExplorerOptions, Step, drive, warp
@@ -143,37 +145,45 @@ class _Generators:
         return cls(*(np.random.default_rng(child) for child in children))
 
 
-def record_session(path: Path, options: SessionOptions) -> Session:
+def record_session(
+    path: Path, options: SessionOptions, force: bool = False, interrupts: Interrupts | None = None
+) -> Session:
     """Record a session to a log.
 
     Args:
         path: The log to write.
         options: What is recorded.
+        force: Whether a file in its place may be replaced that is no earlier recording.
+        interrupts: Holds interruptions back while a step is written; None: they come anywhere.
 
     Returns:
         What was recorded.
 
     Raises:
-        UsageError: The primitives do not fit on the floor, or the robot has no place to stand.
+        UsageError: The primitives do not fit on the floor, the robot has no place to stand, there is another file in
+            the log's place, or it is the world's own.
         WorldError: The world's file is no world.
         OutputError: The log cannot be written.
-        InterruptedRecordingError: The recording was interrupted; the message names the file of the recorded part.
+        InterruptedRunError: The recording was interrupted; the message names the file of the recorded part.
     """
+    interrupts = interrupts or Interrupts()
     generators = _Generators.from_seed(options.seed)
     if options.world_file:
+        check_no_input([options.world_file], [path])
         world = World.load(options.world_file)
     else:
         world = draw_world(generators.world, options.world, options.placement)
+    check_output(path, RECORDED_LOG, force)
     steps = _steps(Simulator(world, options.movable, options.simulator), options, generators.motion)
     first = next(steps, None)
     if first is None:
         raise UsageError("the robot finds no free place: every stop lies inside a primitive or touches one")
     period = 1 / options.rate
     count = 0
-    with LogWriter(path) as log:
+    with interrupts.held(), LogWriter(path, force) as log:
         _write_preamble(log, options, world)
         writer = _StepWriter(log, options, generators)
-        for step in chain([first], steps):
+        for step in interrupts.released_while_iterating(chain([first], steps)):
             writer.write(START + round(count * period * NS_PER_S), step)
             count += 1
     skipped = options.stops[0] * options.stops[1] - count if options.motion == "warp" else 0

@@ -20,6 +20,7 @@ from mapping.map_metrics import MapScores
 from mapping.mapper import Mapper
 from prim.arrays import FloatArray, Stamps
 from prim.errors import OutputError, UsageError
+from prim.files import check_no_input
 from prim.log.source import LogSource
 from prim.metrics import DetectionErrors, overlap_coefficient
 from prim.parameters import checked_keywords, checked_path, errors_name_parameters, name_parameters
@@ -32,7 +33,7 @@ from replay.keywords import PARAMETERS, SWITCHES, ReplayKeywords, replay_options
 from replay.localization import localize, pose_scans
 from replay.notes import pluralize
 from replay.options import ReplayOptions
-from replay.outputs.exports import check_distinct, log_stem, write_map, write_report, write_trajectory
+from replay.outputs.exports import log_stem, write_map, write_report, write_trajectory
 from replay.outputs.found_primitives import FoundPrimitive, found_primitives
 from replay.outputs.report import report_json
 from replay.pipeline import Pipeline
@@ -110,17 +111,19 @@ class Result:
 
         return draw_picture(self.grid, self.primitives, self.truth)
 
-    def save(self, directory: str | Path) -> list[Path]:
+    def save(self, directory: str | Path, force: bool = False) -> list[Path]:
         """Write the report, the map for nav2, the poses in TUM's format and the picture into a folder.
 
         Args:
             directory: The folder; it is made where there is none.
+            force: Whether files in their places may be replaced that are no earlier results.
 
         Returns:
             The files: LOG.MAPPER.report.json, .pgm, .yaml, .tum and .png.
 
         Raises:
             OutputError: A file cannot be written.
+            UsageError: There is another file in its place.
         """
         folder = checked_path("directory", directory)
         try:
@@ -130,10 +133,11 @@ class Result:
         result = self._replayed
         name = f"{log_stem(result.path)}.{result.options.mapper}"
         files = [folder / f"{name}{suffix}" for suffix in (".report.json", ".pgm", ".yaml", ".tum", ".png")]
-        write_report(files[0], result)
-        write_map(files[1], result.grid)
-        write_trajectory(files[3], result)
-        self.plot().save(files[4])
+        with _errors():
+            write_report(files[0], result, force)
+            write_map(files[1], result.grid, force)
+            write_trajectory(files[3], result, force)
+        self.plot().save(files[4], force)
         return files
 
 
@@ -141,6 +145,7 @@ def replay(
     log: str | Path,
     *,
     save: str | Path | None = None,
+    force: bool = False,
     progress: Callable[[int, int], None] | None = None,
     **options: Unpack[ReplayKeywords],
 ) -> Result:
@@ -149,6 +154,7 @@ def replay(
     Args:
         log: An MCAP log, or the folder of a ROS 2 bag.
         save: Where rerun's recording is saved; None for no recording.
+        force: Whether a file in its place may be replaced that is no earlier recording of prim.
         progress: Called after each scan with the number of scans so far and in all.
         **options: The options of ``prim-replay``, see :class:`replay.keywords.ReplayKeywords`; angles are radians.
 
@@ -156,21 +162,23 @@ def replay(
         The map, the primitives, the poses, and their errors where the log has ground truth.
 
     Raises:
-        UsageError: A parameter is impossible, or two exclude each other.
+        UsageError: A parameter is impossible, two exclude each other, or there is another file in the recording's
+            place.
         LogReadError: The log cannot be read, or lacks what the replay needs.
         OutputError: The recording cannot be written.
     """
     with _errors():
-        pipeline = _pipeline(log, save, progress, options)
+        pipeline = _pipeline(log, save, force, progress, options)
         if len(pipeline.options.mappers) > 1:
             raise UsageError(f"mapper is {pipeline.options.mapper}: replay_each has a result for each of several")
-        return _as_result(pipeline.run())
+        return _as_result(_run(pipeline)[0])
 
 
 def replay_each(
     log: str | Path,
     *,
     save: str | Path | None = None,
+    force: bool = False,
     progress: Callable[[int, int], None] | None = None,
     **options: Unpack[ReplayKeywords],
 ) -> dict[str, Result]:
@@ -179,6 +187,7 @@ def replay_each(
     Args:
         log: An MCAP log, or the folder of a ROS 2 bag.
         save: Where rerun's recording of all of them is saved; None for no recording.
+        force: Whether a file in its place may be replaced that is no earlier recording of prim.
         progress: Called after each scan with the number of scans so far and in all.
         **options: As for :func:`replay`.
 
@@ -186,12 +195,13 @@ def replay_each(
         The result of each mapper by its name.
 
     Raises:
-        UsageError: A parameter is impossible, or two exclude each other.
+        UsageError: A parameter is impossible, two exclude each other, or there is another file in the recording's
+            place.
         LogReadError: The log cannot be read, or lacks what the replay needs.
         OutputError: The recording cannot be written.
     """
     with _errors():
-        results = _pipeline(log, save, progress, options).run_each()
+        results = _run(_pipeline(log, save, force, progress, options))
         return {result.options.mapper: _as_result(result) for result in results}
 
 
@@ -347,32 +357,41 @@ def _checked_pairs(scans: Iterable[object]) -> Iterator[tuple[Scan, Pose2D]]:
 
 
 def _errors() -> AbstractContextManager[None]:
-    return errors_name_parameters({*PARAMETERS, "save"}, SWITCHES)
+    return errors_name_parameters({*PARAMETERS, "save"}, {*SWITCHES, "force"})
+
+
+def _run(pipeline: Pipeline) -> tuple[ReplayResult, ...]:
+    """Replay a log and close its recording."""
+    results = pipeline.run_each()
+    pipeline.viewer.finish(results)
+    return results
 
 
 def _pipeline(
     log: str | Path,
     save: str | Path | None,
+    force: bool,
     progress: Callable[[int, int], None] | None,
     options: Mapping[str, Any],
 ) -> Pipeline:
     """Make the pipeline of a replay, its arguments checked. Raises UsageError."""
     path = checked_path("log", log)
-    chosen = replay_options(**checked_keywords(ReplayKeywords, options, ("save", "progress")))
+    chosen = replay_options(**checked_keywords(ReplayKeywords, options, ("save", "force", "progress")))
     if progress is not None and not callable(progress):
         raise UsageError(f"progress is {progress!r}: give a function of two numbers")
     recording = None if save is None else checked_path("save", save)
-    check_distinct([path], [recording] if recording else [])
-    return Pipeline(path, chosen, _viewer(recording), progress)
+    if recording:
+        check_no_input([path, *([chosen.weights] if chosen.weights else [])], [recording])
+    return Pipeline(path, chosen, _viewer(recording, force), progress)
 
 
-def _viewer(save: Path | None) -> Viewer | None:
+def _viewer(save: Path | None, force: bool) -> Viewer | None:
     """Make the viewer that saves a recording; None where none is wanted."""
     if save is None:
         return None
     from replay.viewer import RerunViewer
 
-    return RerunViewer(ViewerOptions(save=save), announce=lambda line: None)
+    return RerunViewer(ViewerOptions(save=save, force=force), announce=lambda line: None)
 
 
 def _as_result(result: ReplayResult) -> Result:

@@ -6,6 +6,7 @@ from typing import NamedTuple
 
 from mapping.grid import GridFrame, OccupancyGrid
 from mapping.map_metrics import MapScores
+from prim.interrupts import Interrupts
 from prim.scan import PosedScan
 from replay.detection.stage import DetectionResult, DetectionStage, make_detection_stage
 from replay.intervals import NEVER, snapshot_interval
@@ -41,6 +42,7 @@ class Branch:
         evaluator: Compares maps with the ground truth.
         viewer: Shows the map and the detections.
         shared: The timer of the replay.
+        interrupts: Lets interruptions come while primitives are detected.
 
     Attributes:
         options: Options of the replay, with this mapper alone.
@@ -56,11 +58,15 @@ class Branch:
         evaluator: ReplayEvaluator,
         viewer: Viewer,
         shared: StageTimer,
+        interrupts: Interrupts,
     ) -> None:
         self.options = options
         self.mapper = options.mapper
         self._evaluator = evaluator
         self._viewer = viewer
+        self._interrupts = interrupts
+        self._grid: OccupancyGrid | None = None
+        self._detections: DetectionResult | None = None
         self._timer = timer = StageTimer(shared)
         self.seconds = timer.seconds
         self._detection = make_detection_stage(
@@ -87,7 +93,9 @@ class Branch:
         """Map a scan, detect primitives and show what came of it, each where it is due."""
         position, stamp = posed.position, posed.scan.stamp
         seconds = self._mapping.update(posed)
-        detections = self._detection.update(posed, self._mapping.mapper)
+        with self._interrupts.released():
+            detections = self._detection.update(posed, self._mapping.mapper)
+        self._detections = detections or self._detections
         grid = self._mapping.snapshot(position, detections is not None)
         scores = None if grid is None else self._evaluator.score(grid)
         with self._timer.stage("viewer"):
@@ -97,10 +105,22 @@ class Branch:
             if grid is not None:
                 self._viewer.show_map(self.mapper, position, stamp, grid, scores)
 
-    def finish(self) -> Outcome:
-        """Make the map of all scans, and detect the primitives in it."""
-        grid = self._mapping.finish()
-        return Outcome(grid, self._evaluator.score(grid), self._detection.finish(grid))
+    def finish_map(self) -> OccupancyGrid:
+        """Return the map of all scans, which is made once."""
+        if self._grid is None:
+            self._grid = self._mapping.finish()
+        return self._grid
+
+    def finish_detection(self) -> None:
+        """Detect the primitives in the map of all scans."""
+        grid = self.finish_map()
+        with self._interrupts.released():
+            self._detections = self._detection.finish(grid)
+
+    def outcome(self) -> Outcome:
+        """Return the map of all scans, and the primitives that were detected last."""
+        grid = self.finish_map()
+        return Outcome(grid, self._evaluator.score(grid), self._detections)
 
     @property
     def usage(self) -> Usage:

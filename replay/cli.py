@@ -7,9 +7,10 @@ import math
 import shlex
 import sys
 import time
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
+from functools import partial
 from itertools import takewhile
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -18,9 +19,12 @@ import typer
 
 from prim import __version__, console
 from prim.choices import MapperName, PoseSourceName, SensorModelName
-from prim.errors import PrimError, UsageError
+from prim.errors import InterruptedRunError, PrimError, UsageError
+from prim.interrupts import interrupted_run
 
 if TYPE_CHECKING:
+    from prim.files import ResultFormat
+    from prim.interrupts import Interrupts
     from prim.world import Bounds
     from replay.options import ReplayOptions
     from replay.result import ReplayResult
@@ -42,6 +46,7 @@ def _show_version(wanted: bool) -> None:
 
 @app.command()
 def replay(
+    context: typer.Context,
     logs: Annotated[list[Path], typer.Argument(metavar="LOG...", help="MCAP logs, or folders of ROS 2 bags.")],
     mapper: Annotated[
         str,
@@ -152,6 +157,9 @@ def replay(
     trajectory: Annotated[
         Path | None, typer.Option(metavar="OUT.tum", help="Write the laser's poses in TUM's format.")
     ] = None,
+    force: Annotated[
+        bool, typer.Option("--force", help="Replace files that are no earlier results of prim-replay.")
+    ] = False,
     recover: Annotated[bool, typer.Option("--recover", help="Read what is intact of a damaged log.")] = False,
     quiet: Annotated[bool, typer.Option("--quiet", help="Print errors only.")] = False,
     verbose: Annotated[
@@ -170,8 +178,8 @@ def replay(
     from replay.keywords import replay_options
     from replay.viewing.protocol import ViewerOptions
 
-    viewer = ViewerOptions(save, spawn, connect, serve, live=rate is not None)
-    if no_viewer and (viewer != ViewerOptions(live=viewer.live) or map_every):
+    viewer = ViewerOptions(save, spawn, connect, serve, live=rate is not None, force=force)
+    if no_viewer and (viewer != ViewerOptions(live=viewer.live, force=force) or map_every):
         raise UsageError("--no-viewer excludes --save, --spawn, --connect, --serve and --map-every")
     options = replay_options(
         mapper=mapper,
@@ -205,18 +213,28 @@ def replay(
         weights=weights,
         recover=recover,
     )
-    files = OutputFiles(save, report, map_output, trajectory)
-    return _replay_logs(logs, options, files, None if no_viewer else viewer, Verbosity(quiet, verbose, debug))
+    files = OutputFiles(save, report, map_output, trajectory, force)
+    run = Run(options, None if no_viewer else viewer, context.obj, Verbosity(quiet, verbose, debug))
+    return _replay_logs(logs, files, run)
 
 
 @dataclass(frozen=True)
 class OutputFiles:
-    """The files that a replay leaves; None for those that are not wanted or not named yet."""
+    """The files that a replay leaves; None for those that are not wanted or not named yet.
+
+    Attributes:
+        recording: Of rerun.
+        report: The report.
+        map: The map, which has two files.
+        trajectory: The laser's poses.
+        force: Whether files in their places may be replaced that are no earlier results.
+    """
 
     recording: Path | None
     report: Path | None
     map: Path | None
     trajectory: Path | None
+    force: bool
 
     def named_after(self, log: Path, mappers: Sequence[str], with_recording: bool) -> OutputFiles:
         """Name the recording and the report, where they have no name yet, after a log, in the current folder.
@@ -257,14 +275,40 @@ class OutputFiles:
         stem = self.map and self.map.with_name(f"{map_stem(self.map)}.{mapper}")
         return dataclasses.replace(self, report=report, map=stem)
 
-    def paths(self, mappers: Sequence[str]) -> list[Path]:
-        """Return the paths of all files of some mappers."""
-        from replay.outputs.exports import map_files
+    def formats(self, mappers: Sequence[str]) -> Iterator[tuple[Path, ResultFormat]]:
+        """Yield the paths of all files of some mappers, and their formats."""
+        from replay.outputs.exports import MAP_DESCRIPTION, MAP_IMAGE, RECORDING, REPORT, TRAJECTORY, map_files
 
         of_each = [self.of_mapper(mapper, mappers) for mapper in mappers]
-        maps = [path for files in of_each if files.map for path in map_files(files.map)]
-        paths = [self.recording, *(files.report for files in of_each), *maps, self.trajectory]
-        return [path for path in paths if path]
+        if self.recording:
+            yield self.recording, RECORDING
+        yield from ((files.report, REPORT) for files in of_each if files.report)
+        for files in of_each:
+            if files.map:
+                yield from zip(map_files(files.map), (MAP_IMAGE, MAP_DESCRIPTION), strict=True)
+        if self.trajectory:
+            yield self.trajectory, TRAJECTORY
+
+    def paths(self, mappers: Sequence[str]) -> list[Path]:
+        """Return the paths of all files of some mappers."""
+        return [path for path, _ in self.formats(mappers)]
+
+    def check(self, mappers: Sequence[str]) -> list[Path]:
+        """Check that the files can and may be written; return those that replace earlier ones.
+
+        Args:
+            mappers: The mappers.
+
+        Returns:
+            The paths of files that are there already.
+
+        Raises:
+            OutputError: A file cannot be written.
+            UsageError: It would replace a file that is no earlier result.
+        """
+        from prim.files import check_output
+
+        return [path for path, result in self.formats(mappers) if check_output(path, result, self.force)]
 
 
 @dataclass(frozen=True)
@@ -276,93 +320,148 @@ class Verbosity:
     debug: bool
 
 
+@dataclass(frozen=True)
+class Run:
+    """What holds for all logs of a command.
+
+    Attributes:
+        options: How they are replayed.
+        viewer: Where their recordings go; None for no recordings.
+        interrupts: Holds interruptions back.
+        verbosity: How much is printed.
+    """
+
+    options: ReplayOptions
+    viewer: ViewerOptions | None
+    interrupts: Interrupts
+    verbosity: Verbosity
+
+
 def _with_name_of(mapper: str, path: Path) -> Path:
     """Return a path with a mapper's name before its suffix, as in OUT.det.json or LOG.det.report.json."""
     suffix = REPORT_SUFFIX if path.name.endswith(REPORT_SUFFIX) else path.suffix
     return path.with_name(f"{path.name.removesuffix(suffix)}.{mapper}{suffix}")
 
 
-def _replay_logs(
-    logs: Sequence[Path],
-    options: ReplayOptions,
-    files: OutputFiles,
-    viewer: ViewerOptions | None,
-    verbosity: Verbosity,
-) -> int:
+def _replay_logs(logs: Sequence[Path], files: OutputFiles, run: Run) -> int:
     """Replay logs one after the other; return the exit code of the worst."""
-    from replay.outputs.exports import check_distinct
+    from prim.files import check_distinct, check_no_input
 
-    with_recording = viewer is not None and not viewer.watched
-    jobs = {log: files.named_after(log, options.mappers, with_recording) for log in logs}
-    check_distinct(logs, [path for outputs in jobs.values() for path in outputs.paths(options.mappers)])
+    mappers = run.options.mappers
+    with_recording = run.viewer is not None and not run.viewer.watched
+    jobs = {log: files.named_after(log, mappers, with_recording) for log in logs}
+    if len({log.resolve() for log in logs}) < len(logs):
+        raise UsageError("a log is named twice")
+    outputs = [path for job in jobs.values() for path in job.paths(mappers)]
+    check_no_input([*logs, *([run.options.weights] if run.options.weights else [])], outputs)
+    check_distinct(outputs)
     codes = []
-    for log, outputs in jobs.items():
-        shown = None if viewer is None else dataclasses.replace(viewer, save=outputs.recording)
+    for log, job in jobs.items():
         try:
-            codes.append(_replay_log(log, options, outputs, shown, verbosity))
+            codes.append(_replay_log(log, job, run))
+        except InterruptedRunError:
+            raise
         except PrimError as error:
             if len(jobs) == 1:
                 raise
-            codes.append(console.print_error("prim-replay", error, verbosity.debug))
+            codes.append(console.print_error("prim-replay", error, run.verbosity.debug))
     return next((code for code in (console.FAILED, console.USAGE, PARTLY_LOST) if code in codes), 0)
 
 
-def _replay_log(
-    log: Path, options: ReplayOptions, outputs: OutputFiles, shown: ViewerOptions | None, verbosity: Verbosity
-) -> int:
-    """Replay one log, write its outputs and print its table; return the exit code."""
-    from replay.outputs.exports import check_writable
+def _replay_log(log: Path, outputs: OutputFiles, run: Run) -> int:
+    """Replay one log, write its outputs and print its table; return the exit code.
+
+    Raises:
+        InterruptedRunError: The replay was interrupted; its results until then are written, unless there are earlier
+            ones in their places.
+    """
     from replay.pipeline import Pipeline
 
-    for path in outputs.paths(options.mappers):
-        check_writable(path)
-    viewer = _make_viewer(shown)
-    with console.progress_bar("scans", verbosity.quiet) as progress:
-        results = Pipeline(log, options, viewer, progress).run_each()
-    for result in results:
-        _write_outputs(result, outputs.of_mapper(result.options.mapper, options.mappers))
-    if not verbosity.quiet:
-        _print_results(results, outputs, verbosity.verbose)
-    if shown is not None and shown.serve:
+    replaced = outputs.check(run.options.mappers)
+    viewer = _make_viewer(run.viewer, outputs.recording)
+    with console.progress_bar("scans", run.verbosity.quiet) as progress:
+        results = Pipeline(log, run.options, viewer, progress, run.interrupts).run_each()
+    interruption = results[0].interrupted
+    if interruption is not None and replaced and not outputs.force:
+        viewer.abandon()
+        raise interrupted_run(interruption, "earlier results stay as they are (--force replaces them)")
+    with run.interrupts.held():
+        written, errors = _write_outputs(results, viewer, outputs)
+        if not run.verbosity.quiet:
+            _print_results(results, written, run.verbosity.verbose)
+            if replaced:
+                console.echo("replaced: " + ", ".join(str(path) for path in replaced if path in written))
+        for error in errors[1:]:
+            console.print_error("prim-replay", error, run.verbosity.debug)
+        if errors:
+            raise errors[0]
+    if interruption is not None:
+        raise interrupted_run(interruption, "the results are those of the scans until then")
+    if run.viewer is not None and run.viewer.serve:
         _keep_serving()
     return PARTLY_LOST if results[0].lost else 0
 
 
-def _make_viewer(shown: ViewerOptions | None) -> Viewer | None:
-    """Make the viewer; None where none is wanted."""
+def _make_viewer(shown: ViewerOptions | None, recording: Path | None) -> Viewer:
+    """Make the viewer; one that shows nothing where none is wanted."""
+    from replay.viewing.protocol import NullViewer
+
     if shown is None:
-        return None
+        return NullViewer()
     from replay.viewer import RerunViewer
 
-    return RerunViewer(shown, announce=lambda line: typer.echo(line, err=True))
+    options = dataclasses.replace(shown, save=recording)
+    return RerunViewer(options, announce=lambda line: console.echo(line, err=True))
 
 
-def _write_outputs(result: ReplayResult, outputs: OutputFiles) -> None:
-    """Write the report, the map and the trajectory, where they are wanted."""
-    from replay.outputs.exports import write_map, write_report, write_trajectory
+def _write_outputs(
+    results: Sequence[ReplayResult], viewer: Viewer, outputs: OutputFiles
+) -> tuple[list[Path], list[PrimError]]:
+    """Write the recording, the reports, the maps and the trajectory, where they are wanted.
 
-    if outputs.report:
-        write_report(outputs.report, result)
-    if outputs.map:
-        write_map(outputs.map, result.grid)
+    Returns:
+        The files that were written, and the errors of those that could not be: none of them costs the others.
+    """
+    from replay.outputs.exports import map_files, write_map, write_report, write_trajectory
+
+    force, mappers = outputs.force, [result.options.mapper for result in results]
+    jobs: list[tuple[list[Path], Callable[[], None]]] = []
+    for result in results:
+        own = outputs.of_mapper(result.options.mapper, mappers)
+        if own.report:
+            jobs.append(([own.report], partial(write_report, own.report, result, force)))
+        if own.map:
+            jobs.append(([*map_files(own.map)], partial(write_map, own.map, result.grid, force)))
     if outputs.trajectory:
-        write_trajectory(outputs.trajectory, result)
+        jobs.append(([outputs.trajectory], partial(write_trajectory, outputs.trajectory, results[0], force)))
+    jobs.insert(0, ([outputs.recording] if outputs.recording else [], partial(viewer.finish, results)))
+    written: list[Path] = []
+    errors: list[PrimError] = []
+    for paths, write in jobs:
+        try:
+            write()
+        except PrimError as error:
+            errors.append(error)
+        else:
+            written += paths
+    return written, errors
 
 
-def _print_results(results: Sequence[ReplayResult], outputs: OutputFiles, verbose: bool) -> None:
+def _print_results(results: Sequence[ReplayResult], written: Sequence[Path], verbose: bool) -> None:
     """Print notes, rejected candidates if ``verbose``, the table, and where the outputs are."""
     from replay.result import distinct_notes
 
     for note in distinct_notes(results):
-        typer.echo(f"note: {note}", err=True)
+        console.echo(f"note: {note}", err=True)
     if verbose:
         for result in results:
             _print_rejected(result)
     _print_tables(results, verbose)
-    mappers = [result.options.mapper for result in results]
-    typer.echo("wrote: " + ", ".join(str(path) for path in outputs.paths(mappers)))
-    if outputs.recording:
-        typer.echo(f"open:  rerun {shlex.quote(str(outputs.recording))}")
+    if written:
+        console.echo("wrote: " + ", ".join(str(path) for path in written))
+    for path in written:
+        if path.suffix == ".rrd":
+            console.echo(f"open:  rerun {shlex.quote(str(path))}")
 
 
 def _print_rejected(result: ReplayResult) -> None:
@@ -370,7 +469,7 @@ def _print_rejected(result: ReplayResult) -> None:
     rejections = result.detections.detections.rejected if result.detections else ()
     for rejection in rejections:
         what = f"{rejection.kind} at ({rejection.x:.2f}, {rejection.y:.2f}) m, score {rejection.score:.2f}"
-        typer.echo(f"rejected: {what}: {rejection.reason}", err=True)
+        console.echo(f"rejected: {what}: {rejection.reason}", err=True)
 
 
 def _print_tables(results: Sequence[ReplayResult], verbose: bool) -> None:
@@ -378,33 +477,19 @@ def _print_tables(results: Sequence[ReplayResult], verbose: bool) -> None:
     from replay.outputs.report import comparison_table, shared_rows, summary_rows
 
     several = len(results) > 1
-    _print_table(shared_rows(results) if several else summary_rows(results[0]))
+    console.print_table(shared_rows(results) if several else summary_rows(results[0]))
     if several:
         names, units, *rows = comparison_table(results)
-        _print_table(rows, [f"{name}\n{unit}" for name, unit in zip(names, units, strict=True)])
+        console.print_table(rows, [f"{name}\n{unit}" for name, unit in zip(names, units, strict=True)])
     if verbose:
         for result in results:
             name = f"{result.options.mapper}: " if several else "  "
-            _print_table([(f"{name}{stage}", f"{s:.3f} s") for stage, s in result.seconds.items() if s])
-
-
-def _print_table(rows: Iterable[Sequence[str]], header: Sequence[str] = ()) -> None:
-    """Print rows of cells; those under a header hold numbers but for the first, and stand at the right."""
-    from rich.console import Console
-    from rich.table import Table
-    from rich.text import Text
-
-    table = Table(show_header=bool(header), box=None, pad_edge=False)
-    for name in header:
-        table.add_column(name, justify="left" if name == header[0] else "right")
-    for row in rows:
-        table.add_row(*map(Text, row))
-    Console(highlight=False, soft_wrap=True).print(table)
+            console.print_table([(f"{name}{stage}", f"{s:.3f} s") for stage, s in result.seconds.items() if s])
 
 
 def _keep_serving() -> None:
     """Wait until the user ends a replay that is served."""
-    typer.echo("the replay is done and still served: Ctrl-C ends it", err=True)
+    console.echo("the replay is done and still served: Ctrl-C ends it", err=True)
     with suppress(KeyboardInterrupt):
         while True:
             time.sleep(3600)

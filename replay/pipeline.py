@@ -8,10 +8,11 @@ from pathlib import Path
 
 from mapping.grid import GridFrame
 from prim.errors import UsageError, WorldError
+from prim.interrupts import Interrupts
 from prim.log import open_log
 from prim.log.source import LogSource
 from prim.scan import PosedScan
-from replay.branch import Branch, Outcome
+from replay.branch import Branch
 from replay.ground_truth import GroundTruth
 from replay.localization import Localization, localize, pose_scans
 from replay.mapping_stage import choose_grid_frame
@@ -33,6 +34,8 @@ class Pipeline:
         options: How it is replayed.
         viewer: Shows the replay as it goes; None for no viewer.
         progress: Called after each scan with the number of scans so far and in all.
+        interrupts: Holds interruptions back where something would be torn. While they are active, a replay that is
+            interrupted ends with the results of the scans until then; else KeyboardInterrupt is raised.
     """
 
     def __init__(
@@ -41,11 +44,14 @@ class Pipeline:
         options: ReplayOptions,
         viewer: Viewer | None = None,
         progress: Progress | None = None,
+        interrupts: Interrupts | None = None,
     ) -> None:
         self.path = path
         self.options = options
         self.viewer: Viewer = viewer or NullViewer()
         self._progress = progress or (lambda done, total: None)
+        self._interrupts = interrupts or Interrupts()
+        self._interrupted: KeyboardInterrupt | None = None
         self._timer = StageTimer()
         self._notes: list[str] = []
 
@@ -65,6 +71,8 @@ class Pipeline:
     def run_each(self) -> tuple[ReplayResult, ...]:
         """Replay the log by each of the mappers side by side, from the file to the results.
 
+        The viewer shows them; whoever made it closes it by :meth:`.Viewer.finish`.
+
         Returns:
             A result for each mapper, in the order in which the options name them.
 
@@ -73,7 +81,6 @@ class Pipeline:
             UsageError: The options do not fit together or do not fit the log.
             WeightsError: The weights that the options name cannot be used.
             OutputError: The viewer's recording cannot be created.
-            RecordingError: The viewer's recording could not be written in full, at the end.
         """
         with self._abandoned_on_failure(), open_log(self.path, recover=self.options.recover) as log:
             scans = self._read_scans(log)
@@ -84,14 +91,10 @@ class Pipeline:
             evaluator = ReplayEvaluator(frame, truth, poses, true_poses)
             branches = self._branches(frame, posed_scans, evaluator)
             self._begin_viewer(frame, posed_scans, branches, evaluator)
-            for posed in self._paced(posed_scans):
-                evaluator.update(posed)
-                self._show_scan(posed, evaluator)
-                for branch in branches:
-                    branch.update(posed)
-            outcomes = [branch.finish() for branch in branches]
-            results = self._results(log, posed_scans, evaluator, branches, outcomes)
-            self._show_results(results)
+            with self._interrupts.held():
+                self._map_and_detect(posed_scans, branches, evaluator)
+                results = self._results(log, posed_scans, evaluator, branches)
+                self._show_results(results)
         return results
 
     def _read_scans(self, log: LogSource) -> ScanLog:
@@ -118,9 +121,34 @@ class Pipeline:
     def _branches(self, frame: GridFrame, posed_scans: PosedScans, evaluator: ReplayEvaluator) -> list[Branch]:
         """Make a branch for each mapper: it maps, detects primitives, and shows both."""
         return [
-            Branch(options, frame, posed_scans, evaluator, self.viewer, self._timer)
+            Branch(options, frame, posed_scans, evaluator, self.viewer, self._timer, self._interrupts)
             for options in self.options.by_mapper()
         ]
+
+    def _map_and_detect(
+        self, posed_scans: PosedScans, branches: Sequence[Branch], evaluator: ReplayEvaluator
+    ) -> None:
+        """Map all scans and detect primitives by each branch; where that is interrupted, make maps of what there is.
+
+        Raises:
+            KeyboardInterrupt: There was an interruption before the first scan, or nothing is to be kept.
+        """
+        try:
+            for posed in self._interrupts.released_while_iterating(self._paced(posed_scans)):
+                evaluator.update(posed)
+                self._show_scan(posed, evaluator)
+                for branch in branches:
+                    branch.update(posed)
+            for branch in branches:
+                branch.finish_map()
+                branch.finish_detection()
+        except KeyboardInterrupt as interruption:
+            if not self._interrupts.active or not all(branch.usage.scans for branch in branches):
+                raise
+            self._interrupted = interruption
+            with self._interrupts.held():
+                for branch in branches:
+                    branch.finish_map()
 
     def _paced(self, posed_scans: PosedScans) -> Iterator[PosedScan]:
         """Iterate over the scans, no faster than at the rate that is asked for, and report the progress."""
@@ -168,12 +196,15 @@ class Pipeline:
         posed_scans: PosedScans,
         evaluator: ReplayEvaluator,
         branches: Sequence[Branch],
-        outcomes: Sequence[Outcome],
     ) -> tuple[ReplayResult, ...]:
         """Collect what the stages found out: a result for each branch."""
         scans, total = posed_scans.scan_log, self._timer.total()
         lost = [f"lost: {lost}" for lost in log.lost]
         notes = [*lost, *self._notes, *posed_scans.notes()]
+        if self._interrupted is not None:
+            done = min(branch.usage.scans for branch in branches)
+            notes.append(f"interrupted after {done} of {len(scans)} scans: the results are those until then")
+        outcomes = [branch.outcome() for branch in branches]
         in_branches = sum(sum(branch.seconds.values()) for branch in branches)
         return tuple(
             ReplayResult(
@@ -184,6 +215,7 @@ class Pipeline:
                 scans_used=branch.usage.scans,
                 rays=branch.usage.rays,
                 lost=tuple(log.lost),
+                interrupted=self._interrupted,
                 notes=(*notes, *branch.notes(outcome.grid)),
                 messages_lost=log.messages_lost,
                 poses=posed_scans.poses,
@@ -203,7 +235,7 @@ class Pipeline:
         )
 
     def _show_results(self, results: Sequence[ReplayResult]) -> None:
-        """Show the final maps and detections, the notes and the summary, and close the viewer."""
+        """Show the final maps and detections, and the notes."""
         position, stamp = len(results[0].stamps) - 1, int(results[0].stamps[-1])
         with self._timer.stage("viewer"):
             for result in results:
@@ -212,7 +244,6 @@ class Pipeline:
                 self.viewer.show_map(result.options.mapper, position, stamp, result.grid, result.scores)
             for note in distinct_notes(results):
                 self.viewer.event(position, stamp, note, warning=True)
-            self.viewer.finish(results)
 
     @contextmanager
     def _abandoned_on_failure(self) -> Iterator[None]:

@@ -217,7 +217,7 @@ def _scan_topic(log: LogSource, wanted: str | None) -> Topic:
     if not topics:
         empty_topics = [topic.name for topic in log.topics.values() if topic.type == SCAN_TYPE]
         if empty_topics:
-            raise LogReadError(log.path, f"no messages on {', '.join(empty_topics)}", *log.lost)
+            raise LogReadError(log.path, f"no messages on {', '.join(empty_topics)}", "; ".join(log.lost))
         raise LogReadError(log.path, "no LaserScan in this log", _listing(log))
     if len(topics) > 1:
         raise LogReadError(log.path, f"{len(topics)} scan topics: {names}", "choose one with --scan-topic")
@@ -227,4 +227,4 @@ def _scan_topic(log: LogSource, wanted: str | None) -> Topic:
 def _listing(log: LogSource) -> str:
     topics = sorted(log.topics.values(), key=lambda topic: topic.name)
     listed = ", ".join(f"{topic.name} ({topic.type or topic.encoding})" for topic in topics)
-    return f"its topics: {listed}" if listed else "it has no topics at all"
+    return "; ".join([f"its topics: {listed}" if listed else "it has no topics at all", *log.lost])

@@ -28,6 +28,7 @@ class ReplayResult:
         scans_used: The number of scans that were mapped.
         rays: The number of their rays.
         lost: Parts of the log that could not be read.
+        interrupted: What interrupted the replay, so that its results are those until then; None where nothing did.
         notes: What a user should know.
         messages_lost: The number of messages that could not be read; None where it is not known.
         poses: The laser's poses at the selected scans.
@@ -50,6 +51,7 @@ class ReplayResult:
     scans_used: int
     rays: int
     lost: tuple[str, ...]
+    interrupted: KeyboardInterrupt | None
     notes: tuple[str, ...]
     messages_lost: int | None
     poses: LaserPoses

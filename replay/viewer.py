@@ -3,22 +3,27 @@
 from __future__ import annotations
 
 import math
+import struct
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 from urllib.parse import quote
 
 import numpy as np
-import rerun as rr
 from numpy.typing import NDArray
 
 from mapping.grid import OccupancyGrid
 from mapping.map_metrics import MapScores
 from prim.arrays import FloatArray
+from prim.environment import environment
 from prim.errors import PrimError
+from prim.files import OutputFile
 from prim.metrics import DetectionErrors
 from prim.scan import PosedScan
+from prim.text import printable
 from prim.world import World
 from replay.detection.stage import DetectionResult
+from replay.outputs.exports import APPLICATION, RECORDING
 from replay.result import ReplayResult
 from replay.viewer_layout import (
     ANGLE_ERROR,
@@ -35,7 +40,7 @@ from replay.viewer_layout import (
     blueprint,
     layers,
 )
-from replay.viewing.checks import check_display, check_viewer, create_partial, find_free_port, partial_path
+from replay.viewing.checks import check_display, check_viewer, find_free_port
 from replay.viewing.drawing import (
     confidence_ellipse,
     crop_sheet,
@@ -49,10 +54,14 @@ from replay.viewing.markdown import detections_markdown, summary_markdown
 from replay.viewing.protocol import Scene, ViewerOptions
 from replay.viewing.scan_batch import ScanBatch, ScanEntry
 
+with environment(RUST_LOG="off"):  # see replay.viewer_layout
+    import rerun as rr
+
 if TYPE_CHECKING:
     from detect.detection import Detection
 
-APPLICATION = "prim"
+_FOOTER, _FOOTER_MARK = struct.Struct("<QQI8sI"), b"RRF2FOOT"
+"""The end of a recording that is whole: where its footer begins, its length, a checksum, a mark, a version."""
 
 TRAJECTORY_POINTS = 2000
 """The trajectory is drawn with about this many points at most."""
@@ -104,6 +113,7 @@ class RerunViewer:
             check_viewer(options.connect)
         self._options = options
         self._announce = announce
+        self._output: OutputFile | None = None
         self._recording = rr.RecordingStream(APPLICATION)
         self._recording.set_log_time_enabled(False)
         self._batch = ScanBatch(options.live, options.watched)
@@ -121,7 +131,7 @@ class RerunViewer:
         x0, y0, x1, y1 = scene.bounds
         self._size = max(x1 - x0, y1 - y0)
         self._layers = layers(scene.mappers)
-        self._recording.send_recording_name(f"{scene.log} ({', '.join(scene.mappers)})")
+        self._recording.send_recording_name(printable(f"{scene.log} ({', '.join(scene.mappers)})"))
         self._recording.send_blueprint(blueprint(scene))
         self._name_series("pose_error/position", POSITION_ERROR)
         self._name_series("pose_error/heading", HEADING_ERROR)
@@ -210,26 +220,33 @@ class RerunViewer:
         """See :meth:`.Viewer.event`."""
         self._set_time(position, stamp)
         level = rr.TextLogLevel.WARN if warning else rr.TextLogLevel.INFO
-        self._recording.log("events", rr.TextLog(text, level=level))
+        self._recording.log("events", rr.TextLog(printable(text), level=level))
 
     def finish(self, results: Sequence[ReplayResult]) -> None:
-        """See :meth:`.Viewer.finish`. Raises RecordingError where the recording cannot be written in full."""
+        """See :meth:`.Viewer.finish`.
+
+        Raises:
+            RecordingError: The recording could not be written or sent in full.
+            OutputError: It cannot be put in its place.
+        """
         self._send_batch()
         self._log_static("summary", rr.TextDocument(summary_markdown(results), media_type=rr.MediaType.MARKDOWN))
         try:
             self._recording.flush(timeout_sec=FLUSH_SECONDS)
         except Exception as error:  # rerun raises plain RuntimeErrors
-            raise RecordingError(f"the recording could not be written in full: {error}") from error
+            self.abandon()
+            raise RecordingError(f"the recording could not be written in full: {printable(str(error))}") from error
         if not self._options.serve:
             self._recording.disconnect()
-        if self._options.save is not None:
-            partial_path(self._options.save).replace(self._options.save)
+        if self._output is not None:
+            _check_whole(self._output)
+            self._output.commit()
 
     def abandon(self) -> None:
         """Close the recording and remove its file; an earlier recording of that name stays as it was."""
         self._recording.disconnect()
-        if self._options.save is not None:
-            partial_path(self._options.save).unlink(missing_ok=True)
+        if self._output is not None:
+            self._output.discard()
 
     # The recording: where it goes, times, names
 
@@ -238,7 +255,8 @@ class RerunViewer:
         options = self._options
         sinks: list[Any] = []
         if options.save is not None:
-            sinks.append(rr.FileSink(create_partial(options.save)))
+            self._output = OutputFile(options.save, RECORDING, options.force)
+            sinks.append(rr.FileSink(self._output.part))
         if options.spawn:
             rr.spawn(connect=False)
             sinks.append(rr.GrpcSink())
@@ -378,6 +396,25 @@ class RerunViewer:
 
     def _send_columns(self, path: str, index: Sequence[Any], columns: Any) -> None:
         self._recording.send_columns(path, indexes=index, columns=columns)
+
+
+def _check_whole(output: OutputFile) -> None:
+    """Check that a recording ends as it should: rerun says nothing where its footer found no place on the disk.
+
+    Raises:
+        RecordingError: It does not; it is removed then.
+    """
+    content = _end_of(output.part, _FOOTER.size)
+    if len(content) == _FOOTER.size and _FOOTER.unpack(content)[3] == _FOOTER_MARK:
+        return
+    output.discard()
+    raise RecordingError(f"{output.path}: the recording could not be written in full: is the disk full?")
+
+
+def _end_of(path: Path, size: int) -> bytes:
+    with path.open("rb") as stream:
+        stream.seek(max(0, path.stat().st_size - size))
+        return stream.read(size)
 
 
 def _values(errors: DetectionErrors, series: Mapping[str, object], unit: float) -> list[float]:

@@ -7,10 +7,12 @@ from collections.abc import Sequence
 from itertools import cycle
 from typing import Any
 
-import rerun as rr
-import rerun.blueprint as rrb
-
+from prim.environment import environment
 from replay.viewing.protocol import Scene
+
+with environment(RUST_LOG="off"):  # rerun's log lines: what they say is checked and becomes an error
+    import rerun as rr
+    import rerun.blueprint as rrb
 
 STAMP, SCAN = "stamp", "scan"
 """The two timelines: the log's own time, and the number of the scan."""

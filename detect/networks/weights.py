@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from detect.networks.tiles import STYLES
+from prim.environment import environment
 from prim.errors import PrimError
 from prim.shapes import Kind
 
@@ -124,8 +125,8 @@ def load_weights(path: Path, stage: str, mapper: str | None = None, threads: int
     Raises:
         WeightsError: The file is missing, damaged, a pickle, without a model card, or for something else.
     """
-    import onnxruntime
-
+    with environment(ORT_DISABLE_TELEMETRY="1"):
+        import onnxruntime
     try:
         content = path.read_bytes()
     except OSError as error:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import stat
 from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -61,6 +62,8 @@ _UNSUPPORTED = {
 def _first_bytes(path: Path) -> bytes:
     """Return as many bytes of a file's start as tell its format. Raises LogReadError."""
     try:
+        if not stat.S_ISREG(path.stat().st_mode):
+            raise LogReadError(path, "a pipe or a device, which cannot be read back and forth", "save it to a file")
         with path.open("rb") as stream:
             return stream.read(max(map(len, (*_SOURCES, *_UNSUPPORTED))))
     except OSError as error:

@@ -2,14 +2,22 @@
 
 from __future__ import annotations
 
-import errno
-import os
+import re
 from collections.abc import Mapping
+from contextlib import suppress
 from pathlib import Path
 from types import TracebackType
 
-from prim.errors import InterruptedRecordingError, OutputError
+from prim.files import OutputFile, ResultFormat, output_errors
+from prim.interrupts import interrupted_run
 from prim.log.messages import message_definition
+
+LIBRARY = "prim"
+"""What the header of a recorded log names as its writer."""
+
+RECORDED_LOG = ResultFormat(
+    "a log of prim-record", re.compile(rb"\x89MCAP0\r\n\x01.{8}\x04\0\0\0ros2\x04\0\0\0prim", re.DOTALL)
+)
 
 CHUNK_BYTES, CHUNK_MESSAGES = 256 * 1024, 600
 """A chunk ends when it holds this much; the recorder fills one in a fraction of a second."""
@@ -18,32 +26,36 @@ CHUNK_BYTES, CHUNK_MESSAGES = 256 * 1024, 600
 class LogWriter:
     """Writes a ROS 2 MCAP log: chunked, zstd, with CRCs.
 
-    Until it is closed, the log is written beside ``path``, with ``.part`` appended to its name. Every chunk is handed
-    to the operating system when it ends, and chunks are small, so that a recorder that is killed loses the last
-    fraction of a second and the rest can be read with ``--recover``. Where a chunk ends depends on the messages and
-    not on the time, so that the same messages make the same bytes.
+    Until it is closed, the log is a :class:`prim.files.OutputFile` in the making. Every chunk is handed to the
+    operating system when it ends, and chunks are small, so that a recorder that is killed loses the last fraction of
+    a second and the rest can be read with ``--recover``. Where a chunk ends depends on the messages and not on the
+    time, so that the same messages make the same bytes.
 
     Args:
         path: The log.
+        force: Whether a file in its place may be replaced that is no earlier recording.
+
+    Attributes:
+        path: The log.
+        part: Where it lies until it is closed.
 
     Raises:
         OutputError: The log cannot be written.
-        InterruptedRecordingError: A KeyboardInterrupt ended the ``with`` block; the part until then is in ``.part``.
+        UsageError: There is another file in its place.
+        InterruptedRunError: A KeyboardInterrupt ended the ``with`` block; what was recorded until then is in
+            :attr:`part`.
     """
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, force: bool = False) -> None:
         self.path = path
-        self.part = path.with_name(path.name + ".part")
-        try:
-            if path.is_dir():
-                raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR))
+        self._output = OutputFile(path, RECORDED_LOG, force)
+        self.part = self._output.part
+        with output_errors(path):
             self._file = self.part.open("wb")
-        except OSError as error:
-            raise OutputError(path, error) from error
         from mcap.writer import CompressionType, Writer  # when it is needed: a replay starts faster
 
         self._writer = Writer(self._file, chunk_size=1 << 40, compression=CompressionType.ZSTD, enable_crcs=True)
-        self._writer.start(profile="ros2", library="prim")
+        self._writer.start(profile="ros2", library=LIBRARY)
         self._channels: dict[str, int] = {}
         self._messages_in_chunk, self._bytes_in_chunk = 0, 0
 
@@ -56,17 +68,25 @@ class LogWriter:
         error: BaseException | None,
         traceback: TracebackType | None,
     ) -> None:
+        if error is not None and not isinstance(error, KeyboardInterrupt):
+            self._discard()
+            return
         try:
-            self._writer.finish()  # type: ignore[no-untyped-call]
-            self._file.flush()
-            os.fsync(self._file.fileno())
-            self._file.close()
-            if error is None:
-                self.part.replace(self.path)
-        except OSError as failure:
-            raise OutputError(self.path, failure) from failure
+            with output_errors(self.path):
+                self._writer.finish()  # type: ignore[no-untyped-call]
+                self._file.close()
+        except BaseException:
+            self._discard()
+            raise
         if isinstance(error, KeyboardInterrupt):
-            raise InterruptedRecordingError(f"interrupted: what was recorded until then is in {self.part}") from error
+            raise interrupted_run(error, f"what was recorded until then is in {self.part}") from error
+        self._output.commit()
+
+    def _discard(self) -> None:
+        """Remove what was written of the log."""
+        with suppress(OSError):  # what is still buffered may have no place on the disk
+            self._file.close()
+        self._output.discard()
 
     def add_metadata(self, name: str, values: Mapping[str, str]) -> None:
         """Add a metadata record; call it before the first message.
@@ -108,14 +128,12 @@ class LogWriter:
             stamp: When it was logged and published (ns).
             data: The message in CDR.
         """
-        try:
+        with output_errors(self.path):
             self._writer.add_message(self._channels[topic], stamp, data, stamp)
             self._messages_in_chunk += 1
             self._bytes_in_chunk += len(data)
             if self._messages_in_chunk >= CHUNK_MESSAGES or self._bytes_in_chunk >= CHUNK_BYTES:
                 self.flush()
-        except OSError as error:
-            raise OutputError(self.path, error) from error
 
     def flush(self) -> None:
         """End the current chunk and hand everything to the operating system."""

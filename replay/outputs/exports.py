@@ -2,19 +2,33 @@
 
 from __future__ import annotations
 
-import errno
 import json
-import os
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+import re
 from pathlib import Path
 
 import numpy as np
 
 from mapping.grid import OccupancyGrid
-from prim.errors import OutputError, UsageError
+from prim.files import ResultFormat, write_file
+from prim.text import printable
 from replay.outputs.report import report_json
 from replay.result import ReplayResult
+
+APPLICATION = "prim"
+"""What recordings are called in rerun: the name stands in their first record, in plain text."""
+
+RECORDING = ResultFormat(
+    "a recording of prim", re.compile(rb"RRF2.{0,200}\x1a\x06\x0a\x04" + APPLICATION.encode(), re.DOTALL)
+)
+REPORT = ResultFormat("a report of prim-replay", re.compile(rb'\s*{\s*"schema": "prim-replay/'))
+MAP_IMAGE = ResultFormat("a map of prim-replay", re.compile(rb"P5\n# prim-replay\n"))
+MAP_DESCRIPTION = ResultFormat("a map of prim-replay", re.compile(rb"# prim-replay\n"))
+TRAJECTORY = ResultFormat(
+    "a trajectory of prim-replay", re.compile(rb"\d+\.\d{9}( -?\d+\.\d{9}){2} 0 0 0( -?\d\.\d{9}){2}\n")
+)
+
+_LOG_SUFFIX = re.compile(r"(\.mcap)?(\.[0-9a-f]{8})?\.part$|\.mcap$")
+"""The suffix of a log, or of one that its recorder was killed at."""
 
 FREE_THRESHOLD, OCCUPIED_THRESHOLD = 0.196, 0.65
 OCCUPIED_VALUE, UNKNOWN_VALUE, FREE_VALUE = 0, 205, 254
@@ -23,39 +37,7 @@ occupied; 205 is 0.19608, between them.
 """
 
 
-def check_writable(path: Path) -> None:
-    """Raise OutputError where a file cannot be written, before the work that would be lost."""
-    with _writing(path):
-        if path.is_dir():
-            raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR))
-        if not path.parent.is_dir():
-            raise FileNotFoundError(errno.ENOENT, os.strerror(errno.ENOENT))
-        if not os.access(path if path.exists() else path.parent, os.W_OK):
-            raise PermissionError(errno.EACCES, os.strerror(errno.EACCES))
-
-
-def check_distinct(logs: Sequence[Path], outputs: Sequence[Path]) -> None:
-    """Check that no file would be written twice, or over a log.
-
-    Args:
-        logs: The logs.
-        outputs: The files that would be written.
-
-    Raises:
-        UsageError: One would, or a log is named twice.
-    """
-    files = [path.resolve() for path in outputs]
-    inputs = {log.resolve() for log in logs}
-    if len(inputs) < len(logs):
-        raise UsageError("a log is named twice")
-    for path in files:
-        if path in inputs:
-            raise UsageError(f"{path} is a log: it cannot be an output as well")
-        if files.count(path) > 1:
-            raise UsageError(f"{path} would be written twice: name the outputs, or replay the logs one by one")
-
-
-def write_map(stem: Path, grid: OccupancyGrid) -> None:
+def write_map(stem: Path, grid: OccupancyGrid, force: bool = False) -> None:
     """Write a map as nav2's map_server reads it: an image in PGM, and its description in YAML.
 
     The image's first row is at the map's largest y. Occupied cells are black, free ones white, and unknown ones have
@@ -64,36 +46,40 @@ def write_map(stem: Path, grid: OccupancyGrid) -> None:
     Args:
         stem: The path of both files, with or without either's suffix.
         grid: The map.
+        force: Whether files in their places may be replaced that are no earlier maps of prim-replay.
 
     Raises:
         OutputError: A file cannot be written.
+        UsageError: There is another file in its place.
     """
     image = np.full(grid.frame.shape, UNKNOWN_VALUE, dtype=np.uint8)
     image[grid.free] = FREE_VALUE
     image[grid.occupied] = OCCUPIED_VALUE
-    rows, cols = grid.frame.shape
+    frame = grid.frame
+    rows, cols = frame.shape
     pgm, yaml = map_files(stem)
-    x, y = grid.frame.origin
-    with _writing(pgm):
-        pgm.write_bytes(f"P5\n{cols} {rows}\n255\n".encode() + np.flipud(image).tobytes())
-    with _writing(yaml):
-        yaml.write_text(
-            f"image: {pgm.name}\nmode: trinary\nresolution: {grid.frame.resolution:g}\n"
-            f"origin: [{x:.9g}, {y:.9g}, 0]\nnegate: 0\n"
-            f"occupied_thresh: {OCCUPIED_THRESHOLD}\nfree_thresh: {FREE_THRESHOLD}\n",
-            encoding="utf-8",
-        )
+    x, y = frame.origin
+    description = (
+        f"# prim-replay\nimage: {json.dumps(printable(pgm.name), ensure_ascii=False)}\nmode: trinary\n"
+        f"resolution: {frame.resolution:g}\norigin: [{x:.9g}, {y:.9g}, 0]\nnegate: 0\n"
+        f"occupied_thresh: {OCCUPIED_THRESHOLD}\nfree_thresh: {FREE_THRESHOLD}\n"
+    )
+    pixels = np.flipud(image).tobytes()
+    write_file(pgm, f"P5\n# prim-replay\n{cols} {rows}\n255\n".encode() + pixels, MAP_IMAGE, force)
+    write_file(yaml, description.encode(), MAP_DESCRIPTION, force)
 
 
-def write_trajectory(path: Path, result: ReplayResult) -> None:
+def write_trajectory(path: Path, result: ReplayResult, force: bool = False) -> None:
     """Write the laser's poses in TUM's format (stamp x y z qx qy qz qw; s, m).
 
     Args:
         path: The file.
         result: The replay whose poses are written.
+        force: Whether a file in its place may be replaced that is no earlier trajectory of prim-replay.
 
     Raises:
         OutputError: The file cannot be written.
+        UsageError: There is another file in its place.
     """
     lines = []
     for stamp, pose, valid in zip(result.stamps.tolist(), result.poses.poses, result.poses.valid, strict=True):
@@ -101,13 +87,12 @@ def write_trajectory(path: Path, result: ReplayResult) -> None:
             x, y, half = pose[0], pose[1], pose[2] / 2
             seconds = f"{stamp // 10**9}.{stamp % 10**9:09d}"
             lines.append(f"{seconds} {x:.9f} {y:.9f} 0 0 0 {np.sin(half):.9f} {np.cos(half):.9f}\n")
-    with _writing(path):
-        path.write_text("".join(lines), encoding="utf-8")
+    write_file(path, "".join(lines).encode(), TRAJECTORY, force)
 
 
 def log_stem(path: Path) -> str:
     """Return the name that a log's outputs begin with: its own without its suffix."""
-    return path.resolve().name.removesuffix(".part").removesuffix(".mcap")
+    return _LOG_SUFFIX.sub("", path.resolve().name)
 
 
 def map_files(stem: Path) -> tuple[Path, Path]:
@@ -121,23 +106,16 @@ def map_stem(path: Path) -> str:
     return path.name.removesuffix(".yaml").removesuffix(".pgm")
 
 
-@contextmanager
-def _writing(path: Path) -> Iterator[None]:
-    try:
-        yield
-    except OSError as error:
-        raise OutputError(path, error) from error
-
-
-def write_report(path: Path, result: ReplayResult) -> None:
+def write_report(path: Path, result: ReplayResult, force: bool = False) -> None:
     """Write the report as JSON.
 
     Args:
         path: The file.
         result: The replay to report on.
+        force: Whether a file in its place may be replaced that is no earlier report.
 
     Raises:
         OutputError: The file cannot be written.
+        UsageError: There is another file in its place.
     """
-    with _writing(path):
-        path.write_text(json.dumps(report_json(result), indent=2) + "\n", encoding="utf-8")
+    write_file(path, (json.dumps(report_json(result), indent=2) + "\n").encode(), REPORT, force)

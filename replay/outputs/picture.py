@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import re
+import struct
+import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,10 +15,18 @@ from numpy.typing import NDArray
 
 from mapping.grid import GridFrame, OccupancyGrid
 from prim.arrays import FloatArray
-from prim.errors import OutputError, UsageError
-from prim.parameters import checked_path
+from prim.errors import UsageError
+from prim.files import ResultFormat, write_file
+from prim.parameters import checked_path, errors_name_parameters
 from prim.shapes import Primitive
 from replay.outputs.found_primitives import FoundPrimitive
+
+_SOFTWARE = b"tEXtSoftware\0prim"
+_PNG_SOFTWARE = struct.pack(">I", len(_SOFTWARE) - 4) + _SOFTWARE + struct.pack(">I", zlib.crc32(_SOFTWARE))
+_PNG_HEADER_BYTES = 8 + 25
+"""A PNG file begins with its magic and the chunk IHDR."""
+
+PICTURE = ResultFormat("a picture of prim", re.compile(rb"\x89PNG.{33}" + _SOFTWARE, re.DOTALL))
 
 LONGER_SIDE = 1000
 """About how many pixels the longer side of a picture has; set by hand."""
@@ -42,22 +53,25 @@ class Picture:
 
     @property
     def png(self) -> bytes:
-        """The picture as a PNG file holds it."""
-        return cv2.imencode(".png", cv2.cvtColor(self.pixels, cv2.COLOR_RGB2BGR))[1].tobytes()
+        """The picture as a PNG file holds it, with prim named as the software that drew it."""
+        content = cv2.imencode(".png", cv2.cvtColor(self.pixels, cv2.COLOR_RGB2BGR))[1].tobytes()
+        return content[:_PNG_HEADER_BYTES] + _PNG_SOFTWARE + content[_PNG_HEADER_BYTES:]
 
-    def save(self, path: str | Path) -> None:
+    def save(self, path: str | Path, force: bool = False) -> None:
         """Write the picture as PNG.
 
+        Args:
+            path: The file.
+            force: Whether a file in its place may be replaced that is no earlier picture of prim.
+
         Raises:
-            UsageError: The name does not end in .png.
+            UsageError: The name does not end in .png, or there is another file in its place.
             OutputError: The file cannot be written.
         """
         if checked_path("path", path).suffix.lower() != ".png":
             raise UsageError(f"{path}: a picture is saved as PNG: give a name that ends in .png")
-        try:
-            checked_path("path", path).write_bytes(self.png)
-        except OSError as error:
-            raise OutputError(path, error) from error
+        with errors_name_parameters((), ("force",)):
+            write_file(checked_path("path", path), self.png, PICTURE, force)
 
     def __repr__(self) -> str:
         rows, cols, _ = self.pixels.shape

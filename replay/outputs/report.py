@@ -64,6 +64,7 @@ def report_json(result: ReplayResult) -> dict[str, Any]:
             "recovered": bool(result.lost),
         },
         "pose": {"source": result.poses.source, "rmse_m": rmse[0], "rmse_rad": rmse[1]} | _pose_uncertainty(result),
+        "interrupted": result.interrupted is not None,
         "map": {
             "mapper": result.options.mapper,
             "resolution_m": frame.resolution,

@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import os
 import socket
-from pathlib import Path
 from urllib.parse import urlsplit
 
-from prim.errors import OutputError, PrimError, UsageError
+from prim.errors import PrimError, UsageError
 
 CONNECT_SECONDS = 3.0
 """A viewer must answer within this time (s); set by hand."""
@@ -56,17 +55,3 @@ def find_free_port(first: int) -> int:
                 continue
             return port
     raise UsageError(f"--serve finds no free port from {first} to {first + PORTS_TRIED - 1}")
-
-
-def partial_path(path: Path) -> Path:
-    """Return where a recording lies until it is complete."""
-    return path.with_name(path.name + ".part")
-
-
-def create_partial(path: Path) -> Path:
-    """Create an empty recording beside ``path`` and return its path. Raises OutputError where that fails."""
-    try:
-        partial_path(path).open("wb").close()
-    except OSError as error:
-        raise OutputError(path, error) from error
-    return partial_path(path)

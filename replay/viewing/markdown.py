@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 
+from prim.text import printable
 from replay.detection.stage import DetectionResult
 from replay.outputs.report import comparison_table, shared_rows, summary_rows
 from replay.result import ReplayResult
@@ -13,7 +14,7 @@ from replay.result import ReplayResult
 def summary_markdown(results: Sequence[ReplayResult]) -> str:
     """Return the table that ends a replay; of several mappers, what they share and how they compare."""
     shared = summary_rows(results[0]) if len(results) == 1 else shared_rows(results)
-    rows = "\n".join(f"| **{name}** | {value} |" for name, value in shared)
+    rows = "\n".join(f"| **{name}** | {printable(value)} |" for name, value in shared)
     text = f"| | |\n|---|---|\n{rows}\n"
     if len(results) == 1:
         return text

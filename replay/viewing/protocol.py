@@ -27,6 +27,7 @@ class ViewerOptions:
         spawn: A new viewer.
         connect: The URL of a viewer that runs.
         serve: Web browsers.
+        force: The file may replace one that is no earlier recording of prim.
         live: Every scan is sent at once, as a replay that is held to a rate wants it.
 
     Raises:
@@ -38,6 +39,7 @@ class ViewerOptions:
     connect: str | None = None
     serve: bool = False
     live: bool = False
+    force: bool = False
 
     def __post_init__(self) -> None:
         if self.serve and (self.save or self.spawn or self.connect):
