@@ -25,8 +25,9 @@ from numpy.typing import NDArray
 
 from prim.arrays import FloatArray
 from prim.compiled import inline, kernel
+from prim.errors import UsageError
 from prim.scan import Scan
-from prim.se2 import Pose2D
+from prim.se2 import MAX_COORDINATE, Pose2D
 
 BORDER_SLACK = 1e-3
 """A point less than this (cells) below a cell's border counts as on the border, and so belongs to the cell above.
@@ -134,7 +135,15 @@ def scan_arrays(scan: Scan, pose: Pose2D) -> Fields:
 
     Returns:
         The fields.
+
+    Raises:
+        UsageError: The pose or the scan's geometry is not finite.
     """
+    if not (abs(pose.x) <= MAX_COORDINATE and abs(pose.y) <= MAX_COORDINATE and math.isfinite(pose.theta)):
+        where = f"{pose.x:g} {pose.y:g} m, {pose.theta:g} rad"
+        raise UsageError(f"the laser's pose is {where}: it must be finite and within {MAX_COORDINATE:g} m")
+    if not (math.isfinite(scan.angle_min + scan.angle_increment + scan.range_min) and scan.range_max > 0):
+        raise UsageError(f"the scan cannot be used: {scan.problem}")
     cos, sin = math.cos(pose.theta), math.sin(pose.theta)
     return scan.ranges, scan.directions, pose.x, pose.y, cos, sin, scan.range_min, scan.range_max
 

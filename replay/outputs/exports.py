@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import errno
-import json
 import os
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -12,6 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from mapping.grid import OccupancyGrid
+from prim import strict_json
 from prim.errors import OutputError, UsageError
 from replay.outputs.report import report_json
 from replay.result import ReplayResult
@@ -140,4 +140,4 @@ def write_report(path: Path, result: ReplayResult) -> None:
         OutputError: The file cannot be written.
     """
     with _writing(path):
-        path.write_text(json.dumps(report_json(result), indent=2) + "\n", encoding="utf-8")
+        path.write_text(strict_json.dumps(report_json(result), indent=2) + "\n", encoding="utf-8")
