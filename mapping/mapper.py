@@ -116,8 +116,10 @@ def check_cells(resolution: float, bounds: Bounds | None) -> None:
         UsageError: Where it cannot.
     """
     if not MIN_RESOLUTION <= resolution <= MAX_RESOLUTION:
-        allowed = f"from {MIN_RESOLUTION:g} to {MAX_RESOLUTION:g} m"
-        raise UsageError(f"--resolution is {resolution:g}: it must be above 0, {allowed}")
+        allowed = f"it must be above 0 and at most {MAX_RESOLUTION:g} m"
+        if 0 < resolution < MIN_RESOLUTION:
+            allowed = f"it must be at least {MIN_RESOLUTION:g} m"
+        raise UsageError(f"--resolution is {resolution:g}: {allowed}")
     if bounds is None:
         return
     x0, y0, x1, y1 = bounds

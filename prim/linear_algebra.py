@@ -1,4 +1,4 @@
-"""Linear algebra with a defined result for every matrix: None where it is singular or not finite, never an exception."""
+"""Linear algebra with a defined result for any matrix: None where it is singular or not finite, no exception."""
 
 from __future__ import annotations
 

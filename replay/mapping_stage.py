@@ -13,7 +13,7 @@ import numpy as np
 
 from mapping.forward.mapper import estimate_range_noise
 from mapping.grid import GridFrame, MapSizeError, OccupancyGrid
-from mapping.kernels import MAX_STEPS, hit_extent, scan_arrays
+from mapping.kernels import MAX_STEPS, scan_extent
 from mapping.mapper import Mapper, make_mapper
 from prim.errors import LogReadError
 from prim.scan import PosedScan, Scan
@@ -134,7 +134,7 @@ def blames_log_for_size(path: Path, options: ReplayOptions) -> Iterator[None]:
 
     Args:
         path: The log.
-        options: Options of the replay; where they give bounds, these are to blame.
+        options: Options of the replay; where they give bounds, or cells finer than by default, these are to blame.
 
     Yields:
         Nothing.
@@ -142,7 +142,7 @@ def blames_log_for_size(path: Path, options: ReplayOptions) -> Iterator[None]:
     try:
         yield
     except MapSizeError as error:
-        if options.bounds is not None:
+        if options.bounds is not None or options.resolution < ReplayOptions.resolution:
             raise
         hint = "give a coarser --resolution, the --bounds, or a --max-range where single ranges are too long"
         raise LogReadError(path, f"by its world, poses and ranges, {error.what}", hint) from error
@@ -199,7 +199,7 @@ def grid_frame_of_scans(scans: Iterable[tuple[Scan, Pose2D]], resolution: float)
     Returns:
         The smallest such grid; None without scans.
     """
-    extents = [hit_extent(scan_arrays(scan, pose), 1 / resolution) for scan, pose in scans]
+    extents = [scan_extent(scan, pose, resolution) for scan, pose in scans]
     if not extents:
         return None
     row, col = np.min([extent[:2] for extent in extents], axis=0).tolist()

@@ -50,7 +50,7 @@ from mapping.forward.level import (
 )
 from mapping.forward.options import DEFAULTS, ForwardOptions
 from mapping.grid import UNKNOWN, GridFrame, GrowingGrid, MapSizeError, OccupancyGrid
-from mapping.kernels import hit_extent, scan_arrays
+from mapping.kernels import scan_extent
 from mapping.range_noise import check_noise, neighbour_noise
 from prim.scan import Scan
 from prim.se2 import Pose2D
@@ -191,7 +191,7 @@ class ForwardMapper:
             Whether it holds any measurement.
         """
         if not self._cells.fixed:
-            self._cells.cover(*hit_extent(scan_arrays(scan, pose), 1 / self.resolution))
+            self._cells.cover(*scan_extent(scan, pose, self.resolution))
             check_size(self._cells.frame, self.options)
         return self._rays.add(scan, pose) > 0
 
