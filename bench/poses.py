@@ -91,7 +91,7 @@ def fusion_errors(seed: int) -> Errors:
                 known = Fusion(nodes, TRUE_NOISE)
                 errors["smoothed, true noise"] = estimate_errors(known, truth, times.stamps)
                 errors["frame"] = normalised_frame_error(fused, truth)
-            nees = pose_nees(fused.poses, truth, fused.covariances)
+            nees = pose_nees(fused.poses, truth, fused.covariances) or math.nan
             errors[f"**smoothed**: {name}"] = (*pose_rmse(fused.poses, truth), nees)
     return errors
 
@@ -101,7 +101,7 @@ def estimate_errors(fusion: Fusion, truth: FloatArray, stamps: Stamps, smooth: b
     estimate = fusion.smoothed() if smooth else fusion.filtered()
     at = np.searchsorted(estimate.stamps, stamps)
     poses = estimate.poses[at]
-    return *pose_rmse(poses, truth), pose_nees(poses, truth, estimate.covariances[at])
+    return *pose_rmse(poses, truth), pose_nees(poses, truth, estimate.covariances[at]) or math.nan
 
 
 def normalised_frame_error(fused: LaserPoses, truth: FloatArray) -> tuple[float, ...]:
@@ -223,7 +223,7 @@ def matching_errors(seed: int) -> Errors:
                 matched = match_scans(poses, scans.stamps, posed_scans, 0.01)
                 spent = time.perf_counter() - start
                 assert matched.covariances is not None
-                nees = pose_nees(matched.poses, truth, matched.covariances)
+                nees = pose_nees(matched.poses, truth, matched.covariances) or math.nan
                 errors[source] = (*pose_rmse(poses.poses, truth), math.nan, math.nan)
                 errors[f"{source}, **matched**"] = (*pose_rmse(matched.poses, truth), nees, spent)
     return errors

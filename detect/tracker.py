@@ -33,8 +33,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from detect.kalman import KalmanFilter
+from prim import linear_algebra
 from prim.arrays import FloatArray
-from prim.se2 import angle_difference
+from prim.se2 import MAX_COORDINATE, angle_difference
 from prim.shapes import Kind, Primitive
 
 if TYPE_CHECKING:
@@ -169,7 +170,8 @@ class _Hypothesis:
         count = min(len(measurement), self._size - len(self.kind.sizes))
         innovation, allowed = (measurement - place)[:count], (noise + covariance)[:count, :count]
         lengths = np.abs(innovation) * [1.0, 1.0, self.primitive.bounding_radius][:count]
-        nis = float(innovation @ np.linalg.solve(allowed, innovation))
+        whitened = linear_algebra.solve(allowed, innovation)
+        nis = math.inf if whitened is None else float(innovation @ whitened)
         return nis > self._options.max_innovation and float(lengths.max()) > self._options.min_displacement
 
     def _stand_at(self, place: FloatArray, covariance: FloatArray) -> None:
@@ -222,7 +224,7 @@ class _Hypothesis:
         return self._primitive_of(state[: self._size, 0])
 
     def _primitive_of(self, state: FloatArray) -> Primitive:
-        values = state.tolist()
+        values = np.clip(state, -MAX_COORDINATE, MAX_COORDINATE).tolist()
         theta = values[2] if self.kind.has_angle else None
         size = tuple(max(value, self._options.min_size) for value in values[self._size - len(self.kind.sizes) :])
         return Primitive(self.kind, values[0], values[1], theta, size).canonical()

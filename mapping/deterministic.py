@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapping.grid import UNKNOWN, GridFrame, GrowingGrid, OccupancyGrid
-from mapping.kernels import FREE, OCCUPIED, UNSEEN, hit_extent, mark_scan, scan_arrays
+from mapping.kernels import FREE, OCCUPIED, UNSEEN, mark_scan, scan_arrays, scan_extent
 from prim.scan import Scan
 from prim.se2 import Pose2D
 from prim.world import Bounds
@@ -43,7 +43,7 @@ class DeterministicMapper:
         arrays = scan_arrays(scan, pose)
         cells, inverse_resolution = self._cells, 1 / self.resolution
         if not cells.fixed:
-            cells.cover(*hit_extent(arrays, inverse_resolution))
+            cells.cover(*scan_extent(scan, pose, self.resolution))
         hits = mark_scan(cells.array, (cells.frame.row, cells.frame.col, inverse_resolution), arrays)
         if scan.first_beam == 0:
             self._hits.clear()

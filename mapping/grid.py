@@ -14,6 +14,20 @@ from prim.errors import UsageError
 from prim.world import Bounds
 
 UNKNOWN = np.float32(0.5)
+
+
+class MapSizeError(UsageError):
+    """A map that would have too many cells.
+
+    Attributes:
+        what: How large it would be, without the hint.
+    """
+
+    def __init__(self, what: str) -> None:
+        self.what = what
+        super().__init__(f"{what}: give a coarser --resolution or smaller --bounds")
+
+
 UNKNOWN_GREY = 128
 """Grey value of a probability of 0.5 in an image."""
 
@@ -52,7 +66,7 @@ class GridFrame:
         cols: Number of columns.
 
     Raises:
-        UsageError: Where it would have more than MAX_CELLS cells.
+        MapSizeError: Where it would have more than MAX_CELLS cells.
     """
 
     resolution: float
@@ -64,9 +78,9 @@ class GridFrame:
     def __post_init__(self) -> None:
         if self.rows * self.cols > MAX_CELLS:
             metres = f"{self.cols * self.resolution:.0f} x {self.rows * self.resolution:.0f} m"
-            raise UsageError(
+            raise MapSizeError(
                 f"a map of {metres} has {self.rows * self.cols / 1e6:.0f} million cells of {self.resolution:g} m, "
-                f"more than {MAX_CELLS / 1e6:.0f} million: give a coarser --resolution or smaller --bounds"
+                f"more than {MAX_CELLS / 1e6:.0f} million"
             )
 
     @classmethod

@@ -25,8 +25,9 @@ from numpy.typing import NDArray
 
 from prim.arrays import FloatArray
 from prim.compiled import inline, kernel
+from prim.errors import UsageError
 from prim.scan import Scan
-from prim.se2 import Pose2D
+from prim.se2 import MAX_COORDINATE, Pose2D
 
 BORDER_SLACK = 1e-3
 """A point less than this (cells) below a cell's border counts as on the border, and so belongs to the cell above.
@@ -134,9 +135,37 @@ def scan_arrays(scan: Scan, pose: Pose2D) -> Fields:
 
     Returns:
         The fields.
+
+    Raises:
+        UsageError: The heading or the scan's geometry is not finite.
     """
+    if not math.isfinite(pose.theta):
+        raise UsageError(f"the laser's heading is {pose.theta:g}: it must be finite")
+    if not (math.isfinite(scan.angle_min + scan.angle_increment + scan.range_min) and scan.range_max > 0):
+        raise UsageError(f"the scan cannot be used: {scan.problem}")
     cos, sin = math.cos(pose.theta), math.sin(pose.theta)
     return scan.ranges, scan.directions, pose.x, pose.y, cos, sin, scan.range_min, scan.range_max
+
+
+def scan_extent(scan: Scan, pose: Pose2D, resolution: float) -> tuple[int, int, int, int]:
+    """Return the extent of a scan, see :func:`hit_extent`.
+
+    Args:
+        scan: The scan.
+        pose: The laser's pose in the map frame.
+        resolution: Side of a cell (m).
+
+    Returns:
+        First row, first column, last row and last column (both ends included).
+
+    Raises:
+        UsageError: The pose or the scan's geometry is not finite, or the laser beyond MAX_COORDINATE.
+    """
+    if not (abs(pose.x) <= MAX_COORDINATE and abs(pose.y) <= MAX_COORDINATE):  # so for NaN
+        where = f"{pose.x:g} {pose.y:g}"
+        raise UsageError(f"the laser's position is {where}: it must be finite and within {MAX_COORDINATE:g} m")
+    extent: tuple[int, int, int, int] = hit_extent(scan_arrays(scan, pose), 1 / resolution)
+    return extent
 
 
 @inline

@@ -10,12 +10,13 @@ import numpy as np
 
 from mapping.deterministic import DeterministicMapper
 from mapping.forward.mapper import ForwardMapper
-from mapping.grid import OccupancyGrid
+from mapping.grid import GridFrame, OccupancyGrid
 from mapping.probabilistic import ProbabilisticMapper
+from mapping.range_noise import check_noise
 from prim.choices import MapperName, SensorModelName
 from prim.errors import UsageError
 from prim.scan import Scan
-from prim.se2 import Pose2D
+from prim.se2 import MAX_COORDINATE, Pose2D
 from prim.world import Bounds
 
 
@@ -60,8 +61,8 @@ class Mapper(Protocol):
         """Return the map of all scans."""
 
 
-MAX_RESOLUTION = 100.0
-"""The largest side of a cell (m); set by hand."""
+MIN_RESOLUTION, MAX_RESOLUTION = 1e-6, 100.0
+"""The smallest and the largest side of a cell (m); set by hand."""
 
 MAPPERS = tuple(name.value for name in MapperName)
 SENSOR_MODELS = tuple(name.value for name in SensorModelName)
@@ -101,8 +102,7 @@ def check_mapper(name: str, sensor_model: str = "eq4", noise_std: float | None =
         return
     if not takes_noise(name, sensor_model):
         raise UsageError("--noise-std goes with --mapper forward, or with --mapper prob --sensor-model gaussian")
-    if not 0 < noise_std < math.inf:
-        raise UsageError(f"--noise-std is {noise_std:g}: it must be above 0")
+    check_noise(noise_std)
 
 
 def check_cells(resolution: float, bounds: Bounds | None) -> None:
@@ -115,14 +115,21 @@ def check_cells(resolution: float, bounds: Bounds | None) -> None:
     Raises:
         UsageError: Where it cannot.
     """
-    if not 0 < resolution <= MAX_RESOLUTION:
-        raise UsageError(f"--resolution is {resolution:g}: it must be above 0 and at most {MAX_RESOLUTION:g} m")
+    if not MIN_RESOLUTION <= resolution <= MAX_RESOLUTION:
+        allowed = f"it must be above 0 and at most {MAX_RESOLUTION:g} m"
+        if 0 < resolution < MIN_RESOLUTION:
+            allowed = f"it must be at least {MIN_RESOLUTION:g} m"
+        raise UsageError(f"--resolution is {resolution:g}: {allowed}")
     if bounds is None:
         return
     x0, y0, x1, y1 = bounds
     if not (-math.inf < x0 < x1 < math.inf and -math.inf < y0 < y1 < math.inf):
         given = " ".join(f"{value:g}" for value in bounds)
         raise UsageError(f"--bounds is {given}: X0 must be below X1 and Y0 below Y1")
+    if max(map(abs, bounds)) > MAX_COORDINATE:
+        given = " ".join(f"{value:g}" for value in bounds)
+        raise UsageError(f"--bounds is {given}: no map reaches farther than {MAX_COORDINATE:g} m")
+    GridFrame.covering(bounds, resolution)
 
 
 def make_mapper(

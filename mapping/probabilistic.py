@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapping.grid import GrowingGrid, OccupancyGrid
-from mapping.kernels import TABLE_MARGIN_CELLS, add_log_odds, hit_extent, scan_arrays
+from mapping.kernels import TABLE_MARGIN_CELLS, add_log_odds, scan_arrays, scan_extent
 from prim.arrays import FloatArray
 from prim.scan import Scan
 from prim.se2 import Pose2D
@@ -140,7 +140,7 @@ class ProbabilisticMapper:
         arrays = scan_arrays(scan, pose)
         cells, inverse_resolution = self._cells, 1 / self.resolution
         if not cells.fixed:
-            cells.cover(*hit_extent(arrays, inverse_resolution))
+            cells.cover(*scan_extent(scan, pose, self.resolution))
         place = (cells.frame.row, cells.frame.col, inverse_resolution)
         add_log_odds(cells.array, place, arrays, self._model)
 

@@ -3,11 +3,44 @@
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
+from prim.errors import UsageError
 from prim.normal import NORMAL_MAD
+
+
+@dataclass(frozen=True)
+class NoiseBounds:
+    """The range noise that a user may give; set by hand.
+
+    Attributes:
+        least: M; a scanner's clock resolves no less.
+        largest: M.
+    """
+
+    least: float = 1e-6
+    largest: float = 100.0
+
+
+DEFAULTS = NoiseBounds()
+
+
+def check_noise(noise_std: float, bounds: NoiseBounds = DEFAULTS) -> None:
+    """Check a range noise that was given.
+
+    Args:
+        noise_std: Its standard deviation (m).
+        bounds: What it may be.
+
+    Raises:
+        UsageError: It is not within the bounds.
+    """
+    if not bounds.least <= noise_std <= bounds.largest:
+        allowed = f"from {bounds.least:g} to {bounds.largest:g} m"
+        raise UsageError(f"--noise-std is {noise_std:g}: it must be above 0, {allowed}")
 
 
 def neighbour_noise(ranges: NDArray[np.float32]) -> float | None:

@@ -9,6 +9,7 @@ from typing import SupportsInt
 
 import numpy as np
 
+from prim import linear_algebra
 from prim.arrays import FloatArray
 from prim.se2 import wrap_angles
 from prim.shapes import Primitive, angle_error
@@ -93,7 +94,8 @@ def polygon_iou(a: Primitive, b: Primitive) -> float:
         From 0 to 1.
     """
     first, second, shared = polygon_areas(a, b)
-    return shared / (first + second - shared)
+    union = first + second - shared
+    return shared / union if union > 0 else 0.0
 
 
 def overlap_coefficient(a: Primitive, b: Primitive) -> float:
@@ -109,7 +111,8 @@ def overlap_coefficient(a: Primitive, b: Primitive) -> float:
     if math.hypot(a.x - b.x, a.y - b.y) > a.bounding_radius + b.bounding_radius:
         return 0.0
     first, second, shared = polygon_areas(a, b)
-    return shared / min(first, second)
+    smaller = min(first, second)
+    return shared / smaller if smaller > 0 else 0.0
 
 
 def polygon_areas(a: Primitive, b: Primitive) -> tuple[float, float, float]:
@@ -198,7 +201,7 @@ def pose_rmse(estimate: FloatArray, truth: FloatArray) -> tuple[float, float]:
     return float(np.sqrt((delta[:, :2] ** 2).sum(axis=1).mean())), float(np.sqrt((turn**2).mean()))
 
 
-def pose_nees(estimate: FloatArray, truth: FloatArray, covariances: FloatArray) -> float:
+def pose_nees(estimate: FloatArray, truth: FloatArray, covariances: FloatArray) -> float | None:
     """Compute the mean normalised estimation error squared (NEES; Bar-Shalom, Li and Kirubarajan, 2001, 5.4).
 
     Args:
@@ -207,11 +210,14 @@ def pose_nees(estimate: FloatArray, truth: FloatArray, covariances: FloatArray) 
         covariances: (N, 3, 3) of the estimates.
 
     Returns:
-        The mean; 3 is expected of consistent covariances.
+        The mean; 3 is expected of consistent covariances. None where a covariance is singular or not finite.
     """
     delta = estimate - truth
     delta[:, 2] = wrap_angles(delta[:, 2])
-    return float(np.einsum("ni,ni->n", delta, np.linalg.solve(covariances, delta[..., None])[..., 0]).mean())
+    whitened = linear_algebra.solve(covariances, delta[..., None])
+    if whitened is None:
+        return None
+    return float(np.einsum("ni,ni->n", delta, whitened[..., 0]).mean())
 
 
 def _pair(i: int, j: int, detection: Primitive, truth: Primitive) -> Pair:

@@ -26,7 +26,7 @@ def cast_segments(origin: tuple[float, float], directions: FloatArray, segments:
     along = (segments[:, 2:] - segments[:, :2]).T[:, :, None]
     towards = (segments[:, :2] - origin).T[:, :, None]
     dx, dy = directions.T[:, None, :]
-    with np.errstate(divide="ignore", invalid="ignore"):
+    with np.errstate(divide="ignore", over="ignore", invalid="ignore"):
         scale = 1.0 / (dx * along[1] - dy * along[0])
         distance = (towards[0] * along[1] - towards[1] * along[0]) * scale
         share = (towards[0] * dy - towards[1] * dx) * scale
@@ -51,14 +51,15 @@ def cast_ellipses(origin: tuple[float, float], directions: FloatArray, ellipses:
     x, y, theta, a, b = ellipses.T[:, :, None]
     cos, sin = np.cos(theta), np.sin(theta)
     ox, oy = origin[0] - x, origin[1] - y
-    px, py = (cos * ox + sin * oy) / a, (cos * oy - sin * ox) / b
     dx, dy = directions.T[:, None, :]
-    ux, uy = (cos * dx + sin * dy) / a, (cos * dy - sin * dx) / b
-    square = ux * ux + uy * uy
-    half = ux * px + uy * py
-    beyond = px * px + py * py - 1.0
-    discriminant = half * half - square * beyond
-    root = np.sqrt(np.maximum(discriminant, 0.0))
-    distance = (np.where(beyond > 0, -root, root) - half) / square
+    with np.errstate(divide="ignore", over="ignore", invalid="ignore"):  # an ellipse too small to be met
+        px, py = (cos * ox + sin * oy) / a, (cos * oy - sin * ox) / b
+        ux, uy = (cos * dx + sin * dy) / a, (cos * dy - sin * dx) / b
+        square = ux * ux + uy * uy
+        half = ux * px + uy * py
+        beyond = px * px + py * py - 1.0
+        discriminant = half * half - square * beyond
+        root = np.sqrt(np.maximum(discriminant, 0.0))
+        distance = (np.where(beyond > 0, -root, root) - half) / square
     nearest: FloatArray = np.where((discriminant >= 0) & (distance >= 0), distance, np.inf).min(axis=0)
     return nearest

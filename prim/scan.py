@@ -42,6 +42,9 @@ class RangeOutcome(IntEnum):
     INVALID = 3
 
 
+MAX_TIME_INCREMENT = 1e3
+"""A longer time from beam to beam (s) is none; set by hand."""
+
 _MEASURED, _TOO_NEAR, _NO_RETURN, _INVALID = (np.int8(outcome) for outcome in RangeOutcome)
 
 
@@ -78,7 +81,9 @@ class Scan:
     @property
     def problem(self) -> str | None:
         """What makes the whole scan unusable; None where nothing does."""
-        if not np.isfinite((self.angle_min, self.angle_increment, self.range_min)).all():
+        if not (
+            math.isfinite(self.angle_min) and math.isfinite(self.angle_increment) and math.isfinite(self.range_min)
+        ):
             angles = f"angle_min {self.angle_min:g}, angle_increment {self.angle_increment:g}"
             return f"{angles}, range_min {self.range_min:g}"
         if not self.range_max > max(self.range_min, 0.0):
@@ -93,9 +98,11 @@ class Scan:
     def outcomes(self) -> NDArray[np.int8]:
         """Classify each range (N,) by :class:`RangeOutcome`; limits are compared in the ranges' own precision."""
         z = self.ranges
-        valid = (z >= self.range_min) & (z > 0)
+        with np.errstate(over="ignore"):  # a limit beyond single precision is an infinite one
+            shortest, longest = z.dtype.type(self.range_min), z.dtype.type(self.range_max)
+        valid = (z >= shortest) & (z > 0)
         outcomes = np.where(valid, _MEASURED, _INVALID)
-        outcomes[valid & (z >= self.range_max)] = _NO_RETURN
+        outcomes[valid & (z >= longest)] = _NO_RETURN
         outcomes[z == -np.inf] = _TOO_NEAR
         return outcomes
 
@@ -192,12 +199,13 @@ def deskew(
         return [(scan, pose)]
     edges = np.linspace(0, len(scan.ranges), count + 1).astype(int).tolist()
     last = max(len(scan.ranges) - 1, 1)
+    seconds = scan.time_increment if abs(scan.time_increment) <= MAX_TIME_INCREMENT else 0.0  # 0 for NaN
     pieces = []
     for first, after in pairwise(edges):
         share = (first + after - 1) / 2 / last
         piece = replace(
             scan,
-            stamp=scan.stamp + round(first * scan.time_increment * 1e9),
+            stamp=scan.stamp + round(first * seconds * 1e9),
             angle_min=scan.angle_min + first * scan.angle_increment,
             ranges=scan.ranges[first:after],
             first_beam=first,

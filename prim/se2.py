@@ -18,6 +18,10 @@ from numpy.typing import ArrayLike, NDArray
 
 from prim.arrays import FloatArray, Stamps
 
+MAX_COORDINATE = 1e9
+"""No coordinate (m) is taken to be larger: one that a log or a user gives beyond is refused. Doubles are 1e-7 m apart
+there. Set by hand."""
+
 
 @dataclass(frozen=True, slots=True)
 class Pose2D:

@@ -20,7 +20,6 @@ kind's unit outline stretched by width and height, turned by theta and moved to 
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
@@ -30,10 +29,11 @@ from typing import Any
 
 import numpy as np
 
+from prim import strict_json
 from prim.arrays import FloatArray
 from prim.errors import UsageError
 from prim.raycast import cast_ellipses, cast_segments
-from prim.se2 import angle_difference
+from prim.se2 import MAX_COORDINATE, angle_difference
 
 SIDES_AGREE = 0.03
 """Sides that differ by no more than this share make a shape look more symmetric than its kind is."""
@@ -240,7 +240,8 @@ class Primitive:
         size: Its sizes (m), in the order of the kind's row.
 
     Raises:
-        ValueError: The sizes or the heading do not fit the kind, or a value is not finite, or a size not positive.
+        ValueError: The sizes or the heading do not fit the kind, a value is not finite or beyond MAX_COORDINATE, or
+            a size is not positive.
     """
 
     kind: Kind
@@ -258,8 +259,11 @@ class Primitive:
         if (self.theta is not None) != self.kind.has_angle:
             has = "has one" if self.kind.has_angle else "has none"
             raise ValueError(f"theta of a {self.kind} is {self.theta}: a {self.kind} {has}")
-        if not all(math.isfinite(v) for v in (self.x, self.y, self.theta or 0.0, *self.size)):
-            raise ValueError(f"a {self.kind} has a value that is not finite: {self}")
+        values = (self.x, self.y, self.theta or 0.0, *self.size)
+        if not all(abs(value) <= MAX_COORDINATE for value in values):
+            finite = all(isinstance(value, int) or math.isfinite(value) for value in values)
+            what = f"beyond {MAX_COORDINATE:g}" if finite else "that is not finite"
+            raise ValueError(f"a {self.kind} has a value {what}: {self}")
         if min(self.size) <= 0:
             raise ValueError(f"a {self.kind} has a size that is not positive: {self.sizes}")
 
@@ -403,7 +407,7 @@ class Primitive:
             ValueError: The value does not describe a primitive; the message names what is wrong.
         """
         if not isinstance(value, Mapping):
-            raise ValueError(f"{json.dumps(value)} does not describe a primitive")
+            raise ValueError(f"{strict_json.shown(value)} does not describe a primitive")
         try:
             kind = Kind(value["kind"])
             size = value["size"]
@@ -414,9 +418,9 @@ class Primitive:
             lengths = tuple(float(size[key]) for key in kind.sizes)
             return cls(kind, float(value["x"]), float(value["y"]), theta, lengths)
         except KeyError as missing:
-            raise ValueError(f"{missing.args[0]!r} is missing in {json.dumps(value)}") from None
-        except TypeError:
-            raise ValueError(f"{json.dumps(value)} does not describe a primitive") from None
+            raise ValueError(f"{missing.args[0]!r} is missing in {strict_json.shown(value)}") from None
+        except (TypeError, AttributeError, OverflowError):
+            raise ValueError(f"{strict_json.shown(value)} does not describe a primitive") from None
 
 
 def angle_error(estimate: Primitive, truth: Primitive) -> float | None:

@@ -12,9 +12,11 @@ from typing import Any
 
 import numpy as np
 
+from prim import strict_json
 from prim.arrays import FloatArray
 from prim.errors import WorldError
 from prim.raycast import cast_ellipses, cast_segments
+from prim.se2 import MAX_COORDINATE
 from prim.shapes import Primitive
 
 Wall = tuple[float, float, float, float]
@@ -104,7 +106,7 @@ class World:
             WorldError: The file cannot be read or does not describe a world.
         """
         try:
-            return cls.from_json(json.loads(path.read_text(encoding="utf-8")))
+            return cls.from_json(strict_json.loads(path.read_text(encoding="utf-8")))
         except (UnicodeDecodeError, json.JSONDecodeError) as error:
             raise WorldError(f"{path}: not a world: not a JSON file: {error}") from error
         except OSError as error:
@@ -116,17 +118,19 @@ class World:
 def _listed(value: Mapping[str, Any], key: str) -> list[Any]:
     items = value.get(key, [])
     if not isinstance(items, list):
-        raise ValueError(f"{key} is a list, not {json.dumps(items)}")
+        raise ValueError(f"{key} is a list, not {strict_json.shown(items)}")
     return items
 
 
 def _numbers(value: Any, count: int, what: str) -> tuple[float, ...]:
     if not isinstance(value, Sequence) or isinstance(value, str) or len(value) != count:
-        raise ValueError(f"{what} is {count} numbers, not {json.dumps(value)}")
+        raise ValueError(f"{what} is {count} numbers, not {strict_json.shown(value)}")
     try:
         numbers = tuple(float(number) for number in value)
-    except TypeError:
-        raise ValueError(f"{what} is {count} numbers, not {json.dumps(value)}") from None
+    except (TypeError, OverflowError):
+        raise ValueError(f"{what} is {count} numbers, not {strict_json.shown(value)}") from None
     if not all(math.isfinite(number) for number in numbers):
         raise ValueError(f"{what} has a number that is not finite: {numbers}")
+    if max(map(abs, numbers)) > MAX_COORDINATE:
+        raise ValueError(f"{what} reaches farther than {MAX_COORDINATE:g} m: {numbers}")
     return numbers

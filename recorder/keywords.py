@@ -23,6 +23,31 @@ MIN_RATE, MAX_RATE = 1e-3, 1e6
 MAX_LENGTH = 1e6
 """Floors and ranges (m) are no larger: float32 ranges would be off by more than centimetres."""
 
+LARGEST = {
+    "noise": 1e3,
+    "noise_std": 1e3,
+    "gps_noise": 1e6,
+    "compass_noise": 1e3,
+    "odom_noise": 1e3,
+    "speed": 10.0,
+    "rays": 1e6,
+    "per_kind": 1e4,
+    "stops": 1e5,
+    "size": MAX_LENGTH,
+    "range_min": MAX_LENGTH,
+    "range_max": MAX_LENGTH,
+}
+"""The largest value of each option (m, rad, m/s, or a number); set by hand."""
+
+SMALLEST = {"size": 1e-2, "speed": 1e-4}
+"""The smallest value of options (m, m/s) that else need only be above 0; set by hand."""
+
+MAX_SHOWN = 10**300
+"""Whole numbers beyond are not written out."""
+
+MAX_SECONDS = 1e8
+"""No session is longer (s): stamps count seconds in 32 bits. Set by hand."""
+
 FULL_TURN, ROUNDING = 2 * math.pi, 1e-9
 
 ALL_KINDS = "all"
@@ -141,11 +166,20 @@ def _check_values(given: Mapping[str, Any]) -> None:
     for name, least in (*((name, None) for name in _POSITIVE), *((name, 0) for name in _NOT_NEGATIVE)):
         if name not in given:
             continue
-        value = min(given[name]) if isinstance(given[name], Sequence) else given[name]
-        if not math.isfinite(value) or value < 0 or (least is None and value == 0):
-            raise UsageError(
-                f"{_option(name)} is {value:g}: it must {'be above' if least is None else 'not be below'} 0"
-            )
+        values = given[name] if isinstance(given[name], Sequence) else [given[name]]
+        for value in values:
+            if not -math.inf < value < math.inf or value < 0 or (least is None and value == 0):
+                raise UsageError(
+                    f"{_option(name)} is {value:g}: it must {'be above' if least is None else 'not be below'} 0"
+                )
+            if not SMALLEST.get(name, 0) <= value <= LARGEST.get(name, math.inf):
+                allowed = f"from {SMALLEST.get(name, 0):g} to {LARGEST.get(name, math.inf):g}"
+                raise UsageError(f"{_option(name)} is {_plain(value)}: it must be {allowed}")
+
+
+def _plain(value: float) -> str:
+    """Return a number as a message shows it, whole ones too large for a float among them."""
+    return f"{value:g}" if abs(value) < MAX_SHOWN else "a number beyond any use"
 
 
 def _check_scanner(options: SessionOptions) -> None:
@@ -155,8 +189,10 @@ def _check_scanner(options: SessionOptions) -> None:
         raise UsageError(f"--range-min {lidar.range_min:g} is not below --range-max {lidar.range_max:g}")
     if not MIN_RATE <= rate <= MAX_RATE:
         raise UsageError(f"--rate is {rate:g}: it must be from {MIN_RATE:g} to {MAX_RATE:.0f} scans per second")
-    if max(lidar.range_max, *options.world.size) > MAX_LENGTH:
-        raise UsageError(f"--range-max and --size must not be above {MAX_LENGTH:.0f} m")
+    scans = options.stops[0] * options.stops[1] if options.motion == "warp" else options.duration * rate
+    if scans / rate > MAX_SECONDS:
+        what = "--duration" if options.motion == "drive" else "--stops over --rate"
+        raise UsageError(f"{what} gives a session of {scans / rate:g} s: it must not be above {MAX_SECONDS:g} s")
     if lidar.fov > FULL_TURN * (1 + ROUNDING):
         turn = f"{math.degrees(lidar.fov):g} degrees, {lidar.fov:g} rad"
         raise UsageError(f"--fov is more than a full turn: {turn}")
@@ -176,6 +212,8 @@ def _per_kind(counts: int | tuple[int, int]) -> tuple[int, int]:
     fewest, most = (counts, counts) if isinstance(counts, int) else counts
     if not 0 <= fewest <= most:
         raise UsageError(f"--per-kind {fewest}-{most} is not a range from small to large")
+    if most > LARGEST["per_kind"]:
+        raise UsageError(f"--per-kind is {_plain(most)}: it must be from 0 to {LARGEST['per_kind']:g}")
     return fewest, most
 
 

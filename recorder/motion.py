@@ -46,6 +46,7 @@ class ExplorerOptions:
         decision_period: Time between two decisions (s).
         heading_gain: Turn rate for a heading error (1/s).
         max_turn_rate: Largest turn rate (rad/s).
+        max_cells: The grid of a larger floor would not fit into memory.
         progress: Coming nearer to the waypoint by less than this is no progress (m).
         patience: Decisions without progress after which the robot backs off and plans anew.
         back_off_decisions: Decisions for which it backs off.
@@ -59,6 +60,7 @@ class ExplorerOptions:
     decision_period: float = 0.05
     heading_gain: float = 4.0
     max_turn_rate: float = 6.0
+    max_cells: int = 4_000_000
     progress: float = 1e-3
     patience: int = 40
     back_off_decisions: int = 15
@@ -114,7 +116,7 @@ def drive(
         The steps; the first one at the start.
 
     Raises:
-        UsageError: The robot has no room to stand.
+        UsageError: The robot has no room to stand, or the floor is too large.
     """
     explorer = Explorer(simulator, rng, options)
     pose = explorer.start()
@@ -236,6 +238,10 @@ class Explorer:
         cell = self._options.cell
         rows = range(math.floor(y0 / cell), math.ceil(y1 / cell))
         cols = range(math.floor(x0 / cell), math.ceil(x1 / cell))
+        if len(rows) * len(cols) > self._options.max_cells:
+            raise UsageError(
+                f"a floor of {x1 - x0:g} x {y1 - y0:g} m is too large to drive on: give a smaller --size"
+            )
         return {(row, col) for row in rows for col in cols if self._has_room(*self._centre((row, col)))}
 
     def _has_room(self, x: float, y: float) -> bool:

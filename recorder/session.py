@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass, field, fields
 from itertools import chain
@@ -10,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from prim import __version__
+from prim import __version__, strict_json
 from prim.errors import UsageError
 from prim.files import check_no_input, check_output
 from prim.interrupts import Interrupts
@@ -201,7 +200,7 @@ def _steps(simulator: Simulator, options: SessionOptions, rng: np.random.Generat
 def _write_preamble(log: LogWriter, options: SessionOptions, world: World) -> None:
     """Write what precedes the first step: the options, the exact world, the topics, the mount of the laser."""
     log.add_metadata("prim", _describe(options))
-    log.add_attachment("world.json", "application/json", json.dumps(world.to_json(), indent=1).encode(), START)
+    log.add_attachment("world.json", "application/json", strict_json.dumps(world.to_json(), indent=1).encode(), START)
     for topic, type_name in _TOPICS:
         log.add_topic(topic, type_name, latched=topic in _LATCHED)
     log.write(TF_STATIC_TOPIC, START, encode_transforms([(START, BASE_FRAME, LASER_FRAME, Pose2D())]))
@@ -258,4 +257,4 @@ def _describe(options: SessionOptions) -> dict[str, str]:
             del described[name]
     if options.world_file:
         described |= {"world_file": options.world_file.name, "world": None}
-    return {"version": __version__} | {name: json.dumps(value) for name, value in described.items()}
+    return {"version": __version__} | {name: strict_json.dumps(value) for name, value in described.items()}

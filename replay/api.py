@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
@@ -18,6 +17,7 @@ import prim.log
 from mapping.grid import OccupancyGrid
 from mapping.map_metrics import MapScores
 from mapping.mapper import Mapper
+from mapping.range_noise import check_noise
 from prim.arrays import FloatArray, Stamps
 from prim.errors import OutputError, UsageError
 from prim.files import check_no_input
@@ -31,6 +31,7 @@ from prim.threads import cores
 from prim.world import Bounds
 from replay.keywords import PARAMETERS, SWITCHES, ReplayKeywords, replay_options
 from replay.localization import localize, pose_scans
+from replay.mapping_stage import blames_log_for_size
 from replay.notes import pluralize
 from replay.options import ReplayOptions
 from replay.outputs.exports import log_stem, write_map, write_report, write_trajectory
@@ -229,7 +230,11 @@ def posed_scans(log: str | Path, **options: Unpack[ReplayKeywords]) -> Iterator[
 
 def _posed_scans(path: Path, options: ReplayOptions) -> Iterator[tuple[Scan, Pose2D]]:
     timer = StageTimer()
-    with _errors(), prim.log.open_log(path, recover=options.recover) as source:
+    with (
+        _errors(),
+        blames_log_for_size(path, options),
+        prim.log.open_log(path, recover=options.recover) as source,
+    ):
         scans = ScanLog(source, options.scan_topic, options.selection)
         poses = localize(source, scans, options, timer).poses
         for posed in pose_scans(scans, poses, options, timer):
@@ -342,8 +347,10 @@ def _checked_noise(noise_std: Any) -> float | None:
     """Return a standard deviation; raise UsageError where it is none."""
     if noise_std is None:
         return None
-    if not isinstance(noise_std, Real | np.floating) or not 0 < float(noise_std) < math.inf:
+    if not isinstance(noise_std, Real | np.floating):
         raise UsageError(f"noise_std is {noise_std!r}: it must be a number above 0")
+    with _errors():
+        check_noise(float(noise_std))
     return float(noise_std)
 
 

@@ -76,7 +76,7 @@ class Branch:
         snapshots = snapshot_interval(options, scans, cells) if viewer.shows else NEVER
         mapper = make_replay_mapper(posed_scans, frame, options, timer)
         streaming = snapshots.scans is not None or self._detection.streaming
-        self._mapping = MappingStage(mapper, snapshots.scans, streaming, timer)
+        self._mapping = MappingStage(mapper, snapshots.scans, streaming, options.resolution, timer)
         self._notes = [note for note in (snapshots.note, self._detection.note) if note]
 
     @property

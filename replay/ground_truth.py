@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import bisect
-import json
 from dataclasses import replace
 
+from prim import strict_json
 from prim.errors import WorldError
 from prim.log.messages import MARKERS_TYPE, TRUE_PRIMITIVES_TOPIC, decode_primitives
 from prim.log.source import LogSource
@@ -37,7 +37,7 @@ class GroundTruth:
         if attachment is None:
             return None
         try:
-            world = World.from_json(json.loads(attachment))
+            world = World.from_json(strict_json.loads(attachment))
         except ValueError as error:
             raise WorldError(f"its world.json does not describe a world: {error}") from error
         topic = log.topics.get(TRUE_PRIMITIVES_TOPIC)

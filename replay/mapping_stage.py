@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+import math
 import time
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 
 from mapping.forward.mapper import estimate_range_noise
-from mapping.grid import GridFrame, OccupancyGrid
-from mapping.kernels import hit_extent, scan_arrays
+from mapping.grid import GridFrame, MapSizeError, OccupancyGrid
+from mapping.kernels import MAX_STEPS, scan_extent
 from mapping.mapper import Mapper, make_mapper
 from prim.errors import LogReadError
 from prim.scan import PosedScan, Scan
@@ -32,20 +35,27 @@ class Usage:
     """How much of a log went into the map.
 
     Attributes:
+        longest: Rays are followed no farther than this (m).
         scans: The number of scans.
         rays: The number of rays.
         hits: The number of rays that returned from a surface.
+        far: How many of these returned from beyond ``longest``, so that their end points are on no map.
     """
 
+    longest: float = math.inf
     scans: int = 0
     rays: int = 0
     hits: int = 0
+    far: int = 0
 
     def count(self, scan: Scan) -> None:
         """Count a scan."""
+        measured = scan.measured
         self.scans += 1
         self.rays += len(scan.ranges)
-        self.hits += int(np.count_nonzero(scan.measured))
+        self.hits += int(np.count_nonzero(measured))
+        if scan.range_max > self.longest:
+            self.far += int(np.count_nonzero(measured & (scan.ranges >= self.longest)))
 
 
 class MappingStage:
@@ -56,6 +66,7 @@ class MappingStage:
         snapshot_interval: N for a snapshot of the map after the scans at positions 0, N, 2N and so on; None for no
             snapshots.
         streaming: Whether the map is needed before the last scan, by the viewer or by the detector.
+        resolution: Side of a cell (m).
         timer: Counts the time towards the stage «map».
 
     Attributes:
@@ -63,9 +74,11 @@ class MappingStage:
         usage: What went into the map so far.
     """
 
-    def __init__(self, mapper: Mapper, snapshot_interval: int | None, streaming: bool, timer: StageTimer) -> None:
+    def __init__(
+        self, mapper: Mapper, snapshot_interval: int | None, streaming: bool, resolution: float, timer: StageTimer
+    ) -> None:
         self.mapper = mapper
-        self.usage = Usage()
+        self.usage = Usage(MAX_STEPS * resolution)
         self._snapshot_interval = snapshot_interval
         self._add = mapper.update if streaming else mapper.accumulate
         self._timer = timer
@@ -104,9 +117,35 @@ class MappingStage:
         """Return what a user should know where the final map ``grid`` shows nothing."""
         if not self.usage.hits:
             return [f"none of {self.usage.rays} rays returned from a surface: nothing is occupied"]
+        if self.usage.far:
+            return [
+                f"{self.usage.far} of {self.usage.hits} rays that returned from a surface are longer than "
+                f"{self.usage.longest:.0f} m ({MAX_STEPS:.0f} cells): where they end is not on the map; "
+                "give a coarser --resolution if that is right, else --max-range"
+            ]
         if not (grid.free | grid.occupied).any():
             return ["no ray crosses the map's bounds: all of it is unknown"]
         return []
+
+
+@contextmanager
+def blames_log_for_size(path: Path, options: ReplayOptions) -> Iterator[None]:
+    """Raise LogReadError where a map in a ``with`` block is too large because of what the log holds.
+
+    Args:
+        path: The log.
+        options: Options of the replay; where they give bounds, or cells finer than by default, these are to blame.
+
+    Yields:
+        Nothing.
+    """
+    try:
+        yield
+    except MapSizeError as error:
+        if options.bounds is not None or options.resolution < ReplayOptions.resolution:
+            raise
+        hint = "give a coarser --resolution, the --bounds, or a --max-range where single ranges are too long"
+        raise LogReadError(path, f"by its world, poses and ranges, {error.what}", hint) from error
 
 
 def choose_grid_frame(posed_scans: PosedScans, options: ReplayOptions, world: World | None) -> GridFrame:
@@ -122,6 +161,7 @@ def choose_grid_frame(posed_scans: PosedScans, options: ReplayOptions, world: Wo
 
     Raises:
         LogReadError: The bounds follow from the end points, and no usable scan has a pose.
+        MapSizeError: It would have too many cells.
     """
     if options.bounds is not None:
         return GridFrame.covering(options.bounds, options.resolution)
@@ -159,7 +199,7 @@ def grid_frame_of_scans(scans: Iterable[tuple[Scan, Pose2D]], resolution: float)
     Returns:
         The smallest such grid; None without scans.
     """
-    extents = [hit_extent(scan_arrays(scan, pose), 1 / resolution) for scan, pose in scans]
+    extents = [scan_extent(scan, pose, resolution) for scan, pose in scans]
     if not extents:
         return None
     row, col = np.min([extent[:2] for extent in extents], axis=0).tolist()

@@ -21,6 +21,12 @@ from replay.selection import Selection
 END: Final = "end"
 """The value of ``detect_every`` for one detection, after the last scan."""
 
+MIN_RATE, MAX_RATE = 1e-3, 1e6
+"""The slowest and the fastest replay, in multiples of the log's own speed; set by hand."""
+
+MIN_POSE_NOISE, MAX_POSE_NOISE = 1e-9, 1e6
+"""The smallest and the largest standard deviations of poses (m, rad) that can be given; set by hand."""
+
 MAX_TURN = 2 * math.pi
 """The largest turn (rad) of a laser on its robot: larger ones are degrees given as radians."""
 
@@ -88,8 +94,8 @@ class ReplayOptions:
     def __post_init__(self) -> None:
         self._check_mappers()
         check_cells(self.resolution, self.bounds)
-        if self.rate is not None and not (0 < self.rate < np.inf):
-            raise UsageError(f"--rate is {self.rate:g}: it must be above 0")
+        if self.rate is not None and not MIN_RATE <= self.rate <= MAX_RATE:
+            raise UsageError(f"--rate is {self.rate:g}: it must be above 0, from {MIN_RATE:g} to {MAX_RATE:g}")
         if self.max_range is not None and not self.max_range > 0:
             raise UsageError(f"--max-range is {self.max_range:g}: it must be above 0")
         if self.map_every is not None and self.map_every < 1:
@@ -165,8 +171,8 @@ class ReplayOptions:
             ("--pose-noise", noise.position_std, noise.heading_std),
             ("--odom-noise", noise.odometry_translation_std, noise.odometry_rotation_std),
         ):
-            if metres is None or radians is None:
-                continue
-            if not (0 < metres < math.inf and 0 < radians < math.inf):
-                what = f"{metres:g} m and {math.degrees(radians):g} degrees"
-                raise UsageError(f"{name} is {what}: both must be above 0")
+            given = [value for value in (metres, radians) if value is not None]
+            if not all(MIN_POSE_NOISE <= value <= MAX_POSE_NOISE for value in given):
+                what = f"{metres or 0:g} m and {math.degrees(radians or 0):g} degrees"
+                allowed = f"from {MIN_POSE_NOISE:g} to {MAX_POSE_NOISE:g} m and radians"
+                raise UsageError(f"{name} is {what}: both must be above 0, {allowed}")

@@ -15,7 +15,7 @@ from prim.scan import PosedScan
 from replay.branch import Branch
 from replay.ground_truth import GroundTruth
 from replay.localization import Localization, localize, pose_scans
-from replay.mapping_stage import choose_grid_frame
+from replay.mapping_stage import blames_log_for_size, choose_grid_frame
 from replay.options import ReplayOptions
 from replay.posed_scans import PosedScans, ScanLog
 from replay.replay_evaluator import ReplayEvaluator
@@ -82,7 +82,11 @@ class Pipeline:
             WeightsError: The weights that the options name cannot be used.
             OutputError: The viewer's recording cannot be created.
         """
-        with self._abandoned_on_failure(), open_log(self.path, recover=self.options.recover) as log:
+        with (
+            self._abandoned_on_failure(),
+            blames_log_for_size(self.path, self.options),
+            open_log(self.path, recover=self.options.recover) as log,
+        ):
             scans = self._read_scans(log)
             truth = self._read_truth(log)
             poses, true_poses, _ = self._localize(log, scans)

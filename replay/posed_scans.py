@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -21,6 +22,9 @@ from replay.timing import StageTimer
 
 MAX_SWEEP = 1.0
 """The longest plausible sweep (s) in a log of one scan; set by hand."""
+
+LONGEST_SWEEP = 3600.0
+"""No sweep takes longer (s), however far apart scans are; set by hand."""
 
 MAX_SWEEP_RATIO = 1.5
 """The longest plausible sweep over the median time from one scan to the next; set by hand."""
@@ -52,7 +56,8 @@ class ScanLog:
         decodable, stamps = self._read_stamps()
         self.total = len(stamps)
         gaps = np.diff(np.unique(stamps))
-        self._max_sweep = MAX_SWEEP_RATIO * float(np.median(gaps)) / 1e9 if len(gaps) else MAX_SWEEP
+        usual = MAX_SWEEP_RATIO * float(np.median(gaps)) / 1e9 if len(gaps) else MAX_SWEEP
+        self._max_sweep = min(usual, LONGEST_SWEEP)
         selected = selection.select(stamps) if self.total else np.zeros(0, dtype=np.intp)
         if not len(selected):
             span = f"{(stamps.max() - stamps.min()) / 1e9:.1f} s" if self.total else "none"
@@ -102,7 +107,7 @@ class ScanLog:
     def notes(self) -> list[str]:
         """Return what a user should know of scans that were left out, not deskewed, or have irregular stamps."""
         notes = []
-        if self._given_sweep and not self.sweep:
+        if self._given_sweep and not self.sweep and math.isfinite(self._given_sweep):
             notes.append(
                 f"scans are not deskewed: by their time_increment a sweep takes {self._given_sweep:.3g} s, where the "
                 f"time from one scan to the next allows {self._max_sweep:.3g} s"

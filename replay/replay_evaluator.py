@@ -79,10 +79,15 @@ class ReplayEvaluator:
         if self._true_poses is None or not self.compares_poses:
             return None
         both = self._poses.valid & self._true_poses.valid
-        return pose_rmse(self._poses.poses[both], self._true_poses.poses[both]) if both.any() else None
+        if not both.any():
+            return None
+        rmse = pose_rmse(self._poses.poses[both], self._true_poses.poses[both])
+        return rmse if np.isfinite(rmse).all() else None
 
     def pose_nees(self) -> float | None:
         """Return the mean normalized estimation error squared of the poses; None without covariances or truth.
+
+        None as well where a covariance is singular.
 
         Its expectation is 3, the degrees of freedom, where the covariances are right.
         """

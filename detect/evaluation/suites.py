@@ -13,7 +13,6 @@ Noise n has two readings, a share of 5 m as written and of 1 m as the paper's ma
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -29,6 +28,7 @@ from detect.networks.weights import DETECTOR_FILE
 from detect.training.dataset import DATASET_PRESETS, DatasetOptions, load_samples, session_seeds
 from detect.training.recipe import Announce, announce_duration, ensure_dataset, pretrain_yolo, train_weights
 from mapping.mapper import MAPPERS
+from prim import strict_json
 from prim.errors import OutputError, UsageError
 from prim.shapes import Kind
 
@@ -287,7 +287,7 @@ class ShippedSuite:
             seeds = [seed for _, seed in session_seeds(condition.options)]
             result = evaluate_sessions(seeds, condition.options, mapper, weights, jobs)
         path.parent.mkdir(parents=True, exist_ok=True)
-        write_text(path, json.dumps(result, indent=1))
+        write_text(path, strict_json.dumps(result, indent=1))
 
     def results(self) -> list[ShippedResult]:
         """Return the results so far, of each condition and mapper those with most sessions.
@@ -330,7 +330,7 @@ def evaluate_networks(path: Path, networks: Path, mapper: str, data: Callable[[]
         samples = load_samples(data(), mapper, "val")
         announce(f"evaluating {path.stem}")
         path.parent.mkdir(parents=True, exist_ok=True)
-        write_text(path, json.dumps(evaluate_detector(detector, samples).to_json(), indent=1))
+        write_text(path, strict_json.dumps(evaluate_detector(detector, samples).to_json(), indent=1))
     value = read_result(path)
     assert value is not None
     return value
@@ -340,7 +340,7 @@ def read_result(path: Path) -> Json | None:
     """Read a stored evaluation; None where there is none."""
     if not path.exists():
         return None
-    value: Json = json.loads(path.read_text(encoding="utf-8"))
+    value: Json = strict_json.loads(path.read_text(encoding="utf-8"))
     return value
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -10,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from detect.networks.tiles import STYLES
+from prim import strict_json
 from prim.environment import environment
 from prim.errors import PrimError
 from prim.shapes import Kind
@@ -64,7 +64,7 @@ class ModelCard:
 
     def to_json(self) -> str:
         """Return the JSON text that is stored in the file."""
-        return json.dumps({"schema": SCHEMA} | vars(self))
+        return strict_json.dumps({"schema": SCHEMA} | vars(self))
 
     @classmethod
     def from_json(cls, text: str) -> ModelCard:
@@ -73,7 +73,7 @@ class ModelCard:
         Raises:
             ValueError: The text is no model card of this schema, or has unknown fields or impossible values.
         """
-        value = json.loads(text)
+        value = strict_json.loads(text)
         if not isinstance(value, dict) or value.pop("schema", None) != SCHEMA:
             raise ValueError(f"no {SCHEMA}")
         try:

@@ -32,6 +32,7 @@ from detect.refinement.kernels import (
 from detect.refinement.options import DEFAULTS, EvidenceOptions
 from detect.refinement.rays import RayBundle
 from detect.refinement.sensor_model import BeamModel
+from prim import linear_algebra
 from prim.arrays import FloatArray
 from prim.shapes import Kind, Primitive
 
@@ -94,12 +95,14 @@ def laplace_evidence(fit: KindFit, dispersion: float = 1.0, options: EvidenceOpt
 def _log_determinant(matrix: FloatArray) -> float:
     """Return the logarithm of the determinant of an information matrix (K, K) to which the unit matrix was added.
 
-    Its eigenvalues are at least 1, which rounding can hide where the largest is beyond 1e16 times as large.
+    Its eigenvalues are at least 1, which rounding can hide where the largest is beyond 1e16 times as large. Infinite
+    where the matrix is not finite.
     """
-    sign, log_determinant = np.linalg.slogdet(matrix)
-    if sign > 0:
-        return float(log_determinant)
-    return float(np.log(np.maximum(np.linalg.eigvalsh(matrix), 1.0)).sum())
+    logarithm = linear_algebra.log_determinant(matrix)
+    if logarithm is not None:
+        return logarithm
+    eigenvalues = linear_algebra.eigenvalues(matrix)
+    return math.inf if eigenvalues is None else float(np.log(np.maximum(eigenvalues, 1.0)).sum())
 
 
 @dataclass(frozen=True)
@@ -131,7 +134,8 @@ def importance_sample(
         options: The prior and the sampler's numbers.
 
     Returns:
-        The posterior; its log evidence is -inf where no sample is a shape that the prior allows.
+        The posterior; its log evidence is -inf where no sample is a shape that the prior allows, or where the fit's
+        information is not finite.
     """
     jacobian = JACOBIANS[fit.kind]
     size = jacobian.shape[1]
@@ -139,17 +143,24 @@ def importance_sample(
     at = fit.p @ own
     floor = np.array(options.min_std) @ own
     information = fit.information / sensor.dispersion + np.eye(size)
-    mean, spread = at, _bounded(np.linalg.inv(information), fit.kind, floor, options)
+    inverse = linear_algebra.inverse(information)
+    impossible = KindPosterior(at, np.diag(floor**2), -math.inf, fit.cost)
+    if inverse is None:
+        return impossible
+    mean, spread = at, _bounded(inverse, fit.kind, floor, options)
     wide = jacobian @ (options.sure_deviations**2 * spread) @ jacobian.T
     split = SplitCost.of(fit, wide, bundle, sensor, options)
     rounds = _draws(size, options)
     for count, (standard, log_density) in enumerate(rounds, start=1):
-        lower = np.linalg.cholesky(spread)
+        lower = linear_algebra.cholesky(spread)
+        if lower is None:
+            return impossible
         points = mean + standard @ lower.T
         cost = split.costs(points @ jacobian.T)
         log_weight = -cost / sensor.dispersion - log_density + np.log(np.diag(lower)).sum()
+        log_weight[~np.isfinite(log_weight)] = -math.inf
         if not np.isfinite(log_weight).any():
-            return KindPosterior(at, spread, -math.inf, fit.cost)
+            return impossible
         weight = np.exp(log_weight - log_weight.max())
         last = count == len(rounds)
         share = _tempered(weight, options.min_effective_last if last else options.min_effective, options)
@@ -322,12 +333,17 @@ def compare_kinds(
         options: The prior and the sampler's numbers.
 
     Returns:
-        The posterior, or None where no kind is left, or all are larger than the prior allows.
+        The posterior, or None where no kind is left, all are larger than the prior allows, or none has a finite
+        evidence.
     """
     fits = [fit for fit in fits if (fit.p[3:] < max_size(fit.kind, options)).all()]
     if not fits:
         return None
     rough = {fit.kind: laplace_evidence(fit, sensor.dispersion, options) for fit in fits}
+    fits = [fit for fit in fits if math.isfinite(rough[fit.kind])]
+    if not fits:
+        return None
+    rough = {fit.kind: rough[fit.kind] for fit in fits}
     top = max(rough.values())
     contenders = [fit for fit in fits if rough[fit.kind] > top - options.contender]
     sampled = {fit.kind: importance_sample(fit, bundle, sensor, options) for fit in contenders}

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from detect.refinement.options import DEFAULTS, LineOptions
+from prim import linear_algebra
 from prim.arrays import FloatArray
 from prim.compiled import kernel
 
@@ -87,7 +88,7 @@ def distance_to_line(points: FloatArray, line: Line) -> FloatArray:
 def _principal_axis(points: FloatArray) -> Line:
     """Return the total-least-squares line."""
     middle = points.mean(axis=0)
-    normal = np.linalg.eigh(np.cov((points - middle).T))[1][:, 0]
+    normal = linear_algebra.scatter_axes(points)[:, 0]
     return float(normal[0]), float(normal[1]), float(normal @ middle)
 
 

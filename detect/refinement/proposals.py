@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from detect.refinement.map_cells import MapCells, is_within
 from detect.refinement.options import DEFAULTS, ProposalOptions
 from mapping.morphology import dilate
+from prim import linear_algebra
 from prim.arrays import FloatArray
 from prim.shapes import Kind, Primitive
 
@@ -101,7 +102,7 @@ def bounding_rectangle(
         The rectangle; None where it is smaller or larger than primitives are.
     """
     middle = points.mean(axis=0)
-    axes: NDArray[np.float64] = np.linalg.eigh(np.cov((points - middle).T) + np.eye(2) * 1e-12)[1]
+    axes = linear_algebra.scatter_axes(points, ridge=1e-12)
     along = (points - middle) @ axes
     low, high = along.min(axis=0), along.max(axis=0)
     height, width = (high - low + resolution).tolist()  # eigenvalues rise: the second axis is the longer one

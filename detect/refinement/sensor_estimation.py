@@ -16,6 +16,7 @@ from detect.refinement.kernels import MEASURED, OCCLUSION, PARAMETERS, RANGE, gr
 from detect.refinement.options import DEFAULTS, SensorOptions
 from detect.refinement.rays import RayBundle
 from detect.refinement.sensor_model import BeamModel, table_nearest
+from prim import linear_algebra
 from prim.arrays import FloatArray
 from prim.normal import NORMAL_MAD
 from prim.shapes import Primitive
@@ -164,9 +165,9 @@ def _scan_scores(candidate: Candidate, bundle: RayBundle, sensor: BeamModel) -> 
         gradient(OUTLINES, NUMBERS[fit.kind], fit.p, sensor.data(part), blur, slope, information)
         return jacobian.T @ slope, jacobian.T @ information @ jacobian
 
-    try:
-        whiten = np.linalg.inv(np.linalg.cholesky(score_and_information(bundle)[1]))
-    except np.linalg.LinAlgError:
+    lower = linear_algebra.cholesky(score_and_information(bundle)[1])
+    whiten = None if lower is None else linear_algebra.inverse(lower)
+    if whiten is None:
         return None
     scans, number = np.unique(bundle.scan, return_inverse=True)
     parts = (bundle.select(number == k) for k in range(len(scans)))

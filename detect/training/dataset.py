@@ -15,7 +15,6 @@ interrupted run can be continued. In ``detect`` only training and evaluation use
 
 from __future__ import annotations
 
-import json
 import os
 import tempfile
 from collections.abc import Callable, Iterator, Sequence
@@ -33,6 +32,7 @@ from detect.networks.weights import KIND_NAMES
 from detect.networks.yolo import KINDS
 from mapping.grid import GridFrame, OccupancyGrid
 from mapping.mapper import MAPPERS, make_mapper
+from prim import strict_json
 from prim.errors import OutputError, UsageError
 from prim.log import open_log
 from prim.log.messages import POSE_TYPE, SCAN_TOPIC, TRUE_POSE_TOPIC, decode_poses, decode_scan, planar_pose
@@ -191,7 +191,7 @@ def make_dataset(
 
 def _prepare_folder(folder: Path, options: DatasetOptions) -> None:
     """Make the folders and the manifest, or check that the manifest is that of these options."""
-    manifest = json.dumps({"version": 1, "tile": TILE_SIZE} | asdict(options), indent=1) + "\n"
+    manifest = strict_json.dumps({"version": 1, "tile": TILE_SIZE} | asdict(options), indent=1) + "\n"
     path = folder / "manifest.json"
     try:
         if path.exists() and path.read_text(encoding="utf-8") != manifest:
@@ -236,7 +236,7 @@ def _make_session(folder: Path, options: DatasetOptions, split: str, seed: int) 
             "motion": session.motion,
             "scans": len(scans),
         }
-        (folder / "truth" / split / f"{name}.json").write_text(json.dumps(truth), encoding="utf-8")
+        (folder / "truth" / split / f"{name}.json").write_text(strict_json.dumps(truth), encoding="utf-8")
     _done(folder, split, seed).touch()
 
 
@@ -440,14 +440,14 @@ def image_style(folder: Path, mapper: str) -> str:
         UsageError: The folder holds no data set.
     """
     try:
-        manifest = json.loads((folder / "manifest.json").read_text(encoding="utf-8"))
+        manifest = strict_json.loads((folder / "manifest.json").read_text(encoding="utf-8"))
     except (OSError, ValueError) as error:
         raise UsageError(f"{folder} holds no set: make one with prim-train dataset") from error
     return "rounded" if mapper in manifest.get("rounded", ()) else "grey"
 
 
 def _read_sample(folder: Path, mapper: str, split: str, path: Path) -> Sample:
-    truth: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
+    truth: dict[str, Any] = strict_json.loads(path.read_text(encoding="utf-8"))
     primitives = tuple(Primitive.from_json(value) for value in truth["primitives"])
     image = folder / "images" / mapper / split / f"{path.stem}.png"
     return Sample(image, GridFrame(**truth["frame"]), primitives, truth["noise_std"])

@@ -7,7 +7,6 @@ the kinds, but not the appearance of maps.
 
 from __future__ import annotations
 
-import json
 import math
 import os
 from collections.abc import Iterator
@@ -23,6 +22,7 @@ from numpy.typing import NDArray
 from detect.networks.tiles import TILE_SIZE, Box
 from detect.training.dataset import SPLITS, Progress, bounding_box, write_data_yaml, write_image, yolo_label
 from mapping.grid import UNKNOWN_GREY, GridFrame
+from prim import strict_json
 from prim.errors import UsageError
 from prim.shapes import Kind, Primitive
 
@@ -88,7 +88,7 @@ def make_drawings(folder: Path, options: DrawingOptions, progress: Progress | No
     Raises:
         UsageError: The folder holds a data set with other options.
     """
-    manifest = json.dumps({"version": 2, "tile": TILE_SIZE} | vars(options)) + "\n"
+    manifest = strict_json.dumps({"version": 2, "tile": TILE_SIZE} | vars(options)) + "\n"
     path = folder / "manifest.json"
     if path.exists() and path.read_text(encoding="utf-8") != manifest:
         raise UsageError(f"{folder} holds a set that was made with other options: give another folder")

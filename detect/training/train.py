@@ -5,7 +5,6 @@ Needs the extra ``[train]`` (torch, ultralytics); a replay does not import this.
 
 from __future__ import annotations
 
-import json
 import os
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -22,6 +21,7 @@ from detect.training.crops import CropSamples, collect_crops
 from detect.training.dataset import image_style, load_samples, read_image
 from detect.training.export import import_cnn, import_yolo
 from detect.training.model import ParameterNetwork
+from prim import strict_json
 from prim.errors import UsageError
 from prim.shapes import Kind, Primitive
 
@@ -154,7 +154,7 @@ def train_cnn(
         "kinds": [kind.value for kind in kinds],
         "mapper": mapper,
         "style": image_style(data, mapper),
-        "set": json.dumps(_manifest(data)),
+        "set": strict_json.dumps(_manifest(data)),
     }
     first = _resume(output, settings, network, optimizer, schedule)
     for epoch in range(first, options.epochs):
@@ -392,7 +392,7 @@ def _imported(start: Path, data: Path, mapper: str, output: Path) -> Path:
 def _claim_folder(output: Path, settings: dict[str, Any]) -> None:
     """Write a run's settings into its folder; raise UsageError where it holds a run with others."""
     path = output / "asked.json"
-    text = json.dumps(settings, indent=1) + "\n"
+    text = strict_json.dumps(settings, indent=1) + "\n"
     if path.exists() and path.read_text(encoding="utf-8") != text:
         raise UsageError(f"{output} was trained on another set or with other options: give another folder")
     output.mkdir(parents=True, exist_ok=True)
@@ -400,7 +400,7 @@ def _claim_folder(output: Path, settings: dict[str, Any]) -> None:
 
 
 def _manifest(data: Path) -> Any:
-    return json.loads((data / "manifest.json").read_text(encoding="utf-8"))
+    return strict_json.loads((data / "manifest.json").read_text(encoding="utf-8"))
 
 
 def _plain(options: dict[str, Any]) -> dict[str, Any]:

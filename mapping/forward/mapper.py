@@ -49,10 +49,9 @@ from mapping.forward.level import (
     visits_and_arrival_probability,
 )
 from mapping.forward.options import DEFAULTS, ForwardOptions
-from mapping.grid import UNKNOWN, GridFrame, GrowingGrid, OccupancyGrid
-from mapping.kernels import hit_extent, scan_arrays
-from mapping.range_noise import neighbour_noise
-from prim.errors import UsageError
+from mapping.grid import UNKNOWN, GridFrame, GrowingGrid, MapSizeError, OccupancyGrid
+from mapping.kernels import scan_extent
+from mapping.range_noise import check_noise, neighbour_noise
 from prim.scan import Scan
 from prim.se2 import Pose2D
 from prim.threads import cores, worker_pool
@@ -123,12 +122,12 @@ class ForwardMapper:
             options: The mapper's options.
 
         Raises:
-            UsageError: Where the noise is not above 0, or the map too large.
+            UsageError: Where the noise cannot be, or the map is too large.
         """
         self.resolution = resolution
         self.options = options
-        if noise_std is not None and not 0 < noise_std < math.inf:
-            raise UsageError(f"the noise is {noise_std:g}: it must be above 0")
+        if noise_std is not None:
+            check_noise(noise_std)
         self._cells = GrowingGrid(resolution, bounds, 0, np.uint8)
         check_size(self._cells.frame, options)
         self._fixed_std = noise_std
@@ -192,7 +191,7 @@ class ForwardMapper:
             Whether it holds any measurement.
         """
         if not self._cells.fixed:
-            self._cells.cover(*hit_extent(scan_arrays(scan, pose), 1 / self.resolution))
+            self._cells.cover(*scan_extent(scan, pose, self.resolution))
             check_size(self._cells.frame, self.options)
         return self._rays.add(scan, pose) > 0
 
@@ -485,12 +484,12 @@ def check_size(frame: GridFrame, options: ForwardOptions = DEFAULTS) -> None:
         options: The mapper's options.
 
     Raises:
-        UsageError: Where it does not.
+        MapSizeError: Where it does not.
     """
     if frame.rows * frame.cols > options.max_cells:
-        raise UsageError(
+        raise MapSizeError(
             f"a map of {frame.rows * frame.cols / 1e6:.0f} million cells is too large for --mapper forward "
-            f"(at most {options.max_cells / 1e6:.0f} million): give a coarser --resolution or smaller --bounds"
+            f"(at most {options.max_cells / 1e6:.0f} million)"
         )
 
 

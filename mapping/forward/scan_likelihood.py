@@ -19,6 +19,7 @@ from mapping.forward.likelihood import RayModel, pose_likelihood
 from mapping.forward.mapper import ForwardFit
 from mapping.forward.options import DEFAULTS
 from mapping.grid import GridFrame
+from prim import linear_algebra
 from prim.arrays import FloatArray
 from prim.scan import Scan
 from prim.se2 import Pose2D, rotate
@@ -210,7 +211,7 @@ def maximize_pose(
     """Maximise the posterior of a pose by a few scoring steps (Berndt, Hall, Hall and Hausman 1974).
 
     Far from the maximum the outer products overestimate the information: a step is lengthened while the posterior
-    rises, and halved until it does.
+    rises, and halved until it does. None is taken where the information is singular.
 
     Args:
         likelihood: The likelihood under a map.
@@ -236,7 +237,9 @@ def maximize_pose(
     for _ in range(options.max_steps):
         height = log_posterior(pose, current.log_likelihood)
         gradient = current.gradient - prior_information @ (pose - prior)
-        step: FloatArray = np.linalg.solve(current.information + prior_information, gradient).astype(float)
+        step = linear_algebra.solve(current.information + prior_information, gradient)
+        if step is None:  # nothing says where to
+            break
         reached, length = after(step), 1
         while reached > height and length < options.max_extension and (further := after(2 * step)) > reached:
             step, reached, length = 2 * step, further, 2 * length

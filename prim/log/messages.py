@@ -7,7 +7,6 @@ is first needed.
 
 from __future__ import annotations
 
-import json
 import math
 import struct
 from collections.abc import Callable, Iterable, Sequence
@@ -16,6 +15,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from prim import strict_json
 from prim.arrays import FloatArray
 from prim.log.cdr import SECOND, CdrReader
 from prim.scan import Scan
@@ -248,7 +248,7 @@ def decode_primitives(data: bytes) -> tuple[int, tuple[Primitive, ...]]:
         pose, namespace, text = _read_marker(cdr)
         stamp = pose.stamp
         if namespace == "primitives":
-            truth = json.loads(text)
+            truth = strict_json.loads(text)
             if not isinstance(truth, dict):
                 raise ValueError(f"a marker's text is no object: {text}")
             plane = planar_pose(pose)
@@ -421,7 +421,7 @@ _MAX_CHANNEL = 255
 
 def _primitive_marker(stamp: int, index: int, primitive: Primitive) -> Any:
     outline = primitive.local_outline(_OUTLINE_POINTS)
-    text = json.dumps({"kind": str(primitive.kind), "size": primitive.sizes})
+    text = strict_json.dumps({"kind": str(primitive.kind), "size": primitive.sizes})
     pose = Pose2D(primitive.x, primitive.y, primitive.theta or 0.0)
     color = primitive.kind.row.color
     return _marker(stamp, "primitives", index, _LINE_STRIP, pose, [*outline, outline[0]], text, color)
@@ -429,7 +429,7 @@ def _primitive_marker(stamp: int, index: int, primitive: Primitive) -> Any:
 
 def _walls_marker(stamp: int, world: World) -> Any:
     ends = np.asarray(world.walls).reshape(-1, 2)
-    text = json.dumps({"walls": world.to_json()["walls"]})
+    text = strict_json.dumps({"walls": world.to_json()["walls"]})
     return _marker(stamp, "walls", 0, _LINE_LIST, Pose2D(), list(ends), text, _GREY)
 
 

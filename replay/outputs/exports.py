@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-import json
 import re
 from pathlib import Path
 
 import numpy as np
 
 from mapping.grid import OccupancyGrid
+from prim import strict_json
 from prim.files import ResultFormat, write_file
-from prim.text import printable
 from replay.outputs.report import report_json
 from replay.result import ReplayResult
 
@@ -59,8 +58,9 @@ def write_map(stem: Path, grid: OccupancyGrid, force: bool = False) -> None:
     rows, cols = frame.shape
     pgm, yaml = map_files(stem)
     x, y = frame.origin
+    name = pgm.name if re.fullmatch(r"[\w.-]+", pgm.name) else strict_json.dumps(pgm.name)  # quoted as YAML has it
     description = (
-        f"# prim-replay\nimage: {json.dumps(printable(pgm.name), ensure_ascii=False)}\nmode: trinary\n"
+        f"# prim-replay\nimage: {name}\nmode: trinary\n"
         f"resolution: {frame.resolution:g}\norigin: [{x:.9g}, {y:.9g}, 0]\nnegate: 0\n"
         f"occupied_thresh: {OCCUPIED_THRESHOLD}\nfree_thresh: {FREE_THRESHOLD}\n"
     )
@@ -118,4 +118,4 @@ def write_report(path: Path, result: ReplayResult, force: bool = False) -> None:
         OutputError: The file cannot be written.
         UsageError: There is another file in its place.
     """
-    write_file(path, (json.dumps(report_json(result), indent=2) + "\n").encode(), REPORT, force)
+    write_file(path, (strict_json.dumps(report_json(result), indent=2) + "\n").encode(), REPORT, force)

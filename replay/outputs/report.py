@@ -10,8 +10,10 @@ import numpy as np
 
 from mapping.grid import OccupancyGrid
 from mapping.map_metrics import MapScores
+from prim import strict_json
 from prim.metrics import DetectionErrors
 from prim.shapes import Kind
+from prim.text import printable
 from replay.detection.stage import DetectionResult
 from replay.notes import pluralize
 from replay.outputs.found_primitives import found_primitives
@@ -48,14 +50,23 @@ where it is below this many; set by hand."""
 
 
 def report_json(result: ReplayResult) -> dict[str, Any]:
-    """Return the report of a replay as JSON values (schema ``prim-replay/1``, docs/formats.md)."""
+    """Return the report of a replay as JSON values (schema ``prim-replay/1``, docs/formats.md).
+
+    A number that is not finite is None, as RFC 8259 has no other way to write it.
+    """
+    report: dict[str, Any] = strict_json.finite(_report(result))
+    return report
+
+
+def _report(result: ReplayResult) -> dict[str, Any]:
+    """Return the report; its numbers may be of any kind."""
     frame = result.grid.frame
     seconds = result.seconds
     rmse = result.pose_rmse or (None, None)
     return {
         "schema": SCHEMA,
         "log": {
-            "path": str(result.path),
+            "path": printable(str(result.path)),
             "duration_s": result.duration,
             "scans": result.scans,
             "scans_used": result.scans_used,
@@ -110,12 +121,15 @@ def _pose_uncertainty(result: ReplayResult) -> dict[str, Any]:
 def pose_std(poses: LaserPoses) -> tuple[float, float] | None:
     """Return the root mean square standard deviations of position (m, both axes together) and heading (rad).
 
-    None where the poses have no covariances.
+    None where the poses have no covariances, or none that can be.
     """
     if poses.covariances is None or not poses.valid.any():
         return None
     variances = poses.covariances[poses.valid].diagonal(axis1=1, axis2=2).mean(axis=0)
-    return float(np.sqrt(variances[:2].sum())), float(np.sqrt(variances[2]))
+    position, heading = float(variances[:2].sum()), float(variances[2])
+    if not (0 <= position < math.inf and 0 <= heading < math.inf):
+        return None
+    return math.sqrt(position), math.sqrt(heading)
 
 
 def _errors(result: DetectionResult | None) -> dict[str, Any] | None:
@@ -211,7 +225,7 @@ def _comparison_row(result: ReplayResult) -> list[str]:
 
 
 def _scaled(value: float | None, factor: float, digits: int = 1) -> str:
-    return "" if value is None else f"{factor * value:.{digits}f}"
+    return "" if value is None or not math.isfinite(value) else f"{factor * value:.{digits}f}"
 
 
 def _log_rows(result: ReplayResult) -> Iterator[tuple[str, str]]:

@@ -109,6 +109,8 @@ class LaserPoses:
         if self.covariances is None:
             return (0.0, 0.0) if self.source in EXACT_SOURCES and not self.matched else None
         x, y, theta = np.diagonal(self.covariances, axis1=1, axis2=2)[self.valid].max(axis=0, initial=0.0).tolist()
+        if not (0 <= x + y < math.inf and 0 <= theta < math.inf):
+            return None
         return math.sqrt(x + y), math.sqrt(theta)
 
     def at(self, position: int) -> Pose2D:

@@ -13,6 +13,7 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
+from prim import linear_algebra
 from prim.arrays import FloatArray
 from prim.se2 import wrap_angle
 from replay.poses.fusion_options import NoiseEstimationOptions
@@ -83,7 +84,9 @@ class NoiseEstimator:
         prior_score = -_log_ratios(noise, initial, free) / options.prior_log_std**2
         prior_information = [0.0 if index == HEADING_BIAS else options.prior_log_std**-2 for index in free]
         information = scores.T @ scores + np.diag(prior_information) + options.ridge * np.eye(len(free))
-        step = np.linalg.solve(information, scores.sum(axis=0) + prior_score)
+        step = linear_algebra.solve(information, scores.sum(axis=0) + prior_score)
+        if step is None:  # the readings say nothing: the search ends here
+            return np.zeros(len(free))
         limited: FloatArray = np.clip(step, -options.max_step, options.max_step)
         return limited
 

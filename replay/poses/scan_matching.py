@@ -20,6 +20,7 @@ import numpy as np
 from mapping.forward.mapper import ForwardMapper
 from mapping.forward.options import ForwardOptions
 from mapping.forward.scan_likelihood import ScanLikelihood, ScanRays, maximize_pose
+from prim import linear_algebra
 from prim.arrays import FloatArray, Stamps
 from prim.scan import PosedScan, Scan
 from prim.se2 import (
@@ -267,9 +268,14 @@ class ScanMatcher:
     def _match_one(
         self, likelihood: ScanLikelihood, rays: ScanRays, mount: FloatArray, prior: FilterState
     ) -> FilterState:
-        """Return the maximum a posteriori pose by the prior and one scan, by annealing, and its covariance."""
+        """Return the maximum a posteriori pose by the prior and one scan, by annealing, and its covariance.
+
+        The prior itself where too few rays are on the map, or a covariance is singular.
+        """
         options, spread = self._options, prior.covariance
-        prior_information = _inverse(unpack_symmetric(spread))
+        prior_information = linear_algebra.inverse(unpack_symmetric(spread))
+        if prior_information is None:
+            return prior
         pose = prior.pose.copy()
         deviation = math.sqrt(spread[0] + spread[3] + spread[5])  # m: the heading's at a lever arm of 1 m
         noise_scale = self._first_noise_scale(options.annealing_deviations * deviation, likelihood)
@@ -282,7 +288,9 @@ class ScanMatcher:
             noise_scale = max(noise_scale / 2, 1.0)
         if derivatives.rays < options.min_rays:
             return prior
-        covariance = _inverse(prior_information + derivatives.information)
+        covariance = linear_algebra.inverse(prior_information + derivatives.information)
+        if covariance is None:
+            return prior
         change = pose - prior.pose
         # posterior mean of the squared Mahalanobis distance from the prior, per coordinate: 1 in expectation where
         # the prior's covariance is right
@@ -373,9 +381,3 @@ def _fusion_of(poses: LaserPoses, stamps: Stamps, noise: SensorNoise, options: S
     return Fusion(
         replace(nodes, variance_scales=np.ones(len(trajectory))), SensorNoise(position_std, heading_std, *steps, 0.0)
     )
-
-
-def _inverse(matrix: FloatArray) -> FloatArray:
-    """Return the inverse of a matrix in double precision."""
-    inverse: FloatArray = np.linalg.inv(matrix).astype(float)
-    return inverse

@@ -28,7 +28,7 @@ from prim.log.messages import (
     planar_pose,
 )
 from prim.log.source import LogSource, Topic
-from prim.se2 import Trajectory
+from prim.se2 import MAX_COORDINATE, Trajectory
 from replay.poses.transforms import is_valid_pose
 
 GPS_TYPES = (POINT_TYPE, FIX_TYPE)
@@ -62,7 +62,8 @@ class OdometryLog:
         """What a user should know."""
         if not self.skipped:
             return ()
-        return (f"{self.topic}: {self.skipped} poses that are not finite or have no rotation were skipped",)
+        what = f"not finite, beyond {MAX_COORDINATE:g} m, or without a rotation"
+        return (f"{self.topic}: {self.skipped} poses that are {what} were skipped",)
 
 
 @dataclass(frozen=True)
@@ -280,11 +281,21 @@ def read_gps(log: LogSource, topic: Topic) -> SensorReadings:
     """
     satellites = topic.type == FIX_TYPE
     readings = _read(
-        log, topic, decode_fix if satellites else decode_vector, lambda fix: math.isfinite(fix.x + fix.y)
+        log, topic, decode_fix if satellites else decode_vector, _is_on_earth if satellites else _is_near
     )
     if not satellites or not len(readings.stamps):
         return readings
     return replace(readings, values=geodetic_to_plane(readings.values))
+
+
+def _is_near(fix: StampedVector) -> bool:
+    """Return whether a position lies within MAX_COORDINATE; False for NaN."""
+    return abs(fix.x) <= MAX_COORDINATE and abs(fix.y) <= MAX_COORDINATE
+
+
+def _is_on_earth(fix: StampedVector) -> bool:
+    """Return whether there are a latitude and a longitude (degrees) that can be; False for NaN."""
+    return abs(fix.x) <= 90 and abs(fix.y) <= 360
 
 
 def read_compass(log: LogSource, topic: Topic) -> SensorReadings:
@@ -300,7 +311,7 @@ def read_compass(log: LogSource, topic: Topic) -> SensorReadings:
     Raises:
         LogReadError: A message is damaged.
     """
-    return _read(log, topic, decode_vector, lambda north: 1e-9 < math.hypot(north.x, north.y, north.z) < math.inf)
+    return _read(log, topic, decode_vector, lambda north: 1e-9 < math.hypot(north.x, north.y, north.z) < 1e100)
 
 
 def _read(

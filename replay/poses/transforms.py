@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections import Counter, defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -13,6 +14,7 @@ from numpy.typing import NDArray
 from prim.arrays import FloatArray, Stamps
 from prim.log.messages import MAP_FRAME, ODOM_FRAME, TF_TYPE, StampedPose, decode_poses
 from prim.log.source import LogSource
+from prim.se2 import MAX_COORDINATE
 
 FIXED_FRAMES = (MAP_FRAME, ODOM_FRAME)
 """Frames that do not move (REP 105), in order of preference."""
@@ -127,8 +129,9 @@ class TransformTree:
 
 
 def is_valid_pose(pose: StampedPose) -> bool:
-    """Return whether a pose is finite and its quaternion not close to zero; that it has unit norm is not checked."""
-    return bool(np.isfinite((*pose.translation, *pose.rotation)).all() and np.linalg.norm(pose.rotation) > 1e-3)
+    """Return whether a pose lies within MAX_COORDINATE and its quaternion is near unit norm, by a factor of 1000."""
+    within = all(abs(coordinate) <= MAX_COORDINATE for coordinate in pose.translation)  # False for NaN
+    return within and 1e-3 < math.hypot(*pose.rotation) < 1e3
 
 
 def project_to_plane(

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapping.grid import OccupancyGrid
+from prim import linear_algebra
 from prim.arrays import FloatArray
 from prim.se2 import Pose2D
 from prim.shapes import Primitive
@@ -72,13 +73,14 @@ def pose_stds(pose: Pose2D) -> tuple[float, float]:
     if pose.covariance is None:
         return math.nan, math.nan
     xx, yy, tt = np.diag(pose.covariance).tolist()
-    return math.sqrt(xx + yy), math.sqrt(tt)
+    return tuple(math.sqrt(value) if value >= 0 else math.nan for value in (xx + yy, tt))  # type: ignore[return-value]
 
 
 def confidence_ellipse(pose: Pose2D) -> FloatArray:
     """Return the ring (ELLIPSE_POINTS, 2) in m that holds the true position with 95 % probability."""
     assert pose.covariance is not None
-    variances, axes = np.linalg.eigh(pose.covariance[:2, :2])
+    decomposed = linear_algebra.principal_axes(pose.covariance[:2, :2])
+    variances, axes = decomposed or (np.zeros(2), np.eye(2))
     angle = np.linspace(0, 2 * np.pi, ELLIPSE_POINTS)
     radii = np.sqrt(CHI_SQUARED_95 * np.maximum(variances, 0.0))
     ellipse: FloatArray = np.column_stack((radii[0] * np.cos(angle), radii[1] * np.sin(angle))) @ axes.T

@@ -267,6 +267,27 @@ def test_invalid_options_are_refused_by_name(
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.parametrize(
+    "options",
+    [
+        ["--size", "1e300", "2"], ["--size", "1e-320", "2"], ["--size", "nan", "2"], ["--rate", "1e300"],
+        ["--range-max", "1e300"], ["--noise", "1e300"], ["--noise-std", "1e300"], ["--noise-std", "inf"],
+        ["--gps-noise", "1e300"], ["--compass-noise", "1e300"], ["--rays", "1" + "0" * 30],
+        ["--per-kind", "1" + "0" * 30], ["--stops", "1" + "0" * 30, "2"], ["--fov", "1e300"],
+        ["--motion", "drive", "--duration", "1e300"], ["--motion", "drive", "--speed", "1e300"],
+        ["--motion", "drive", "--speed", "1e-320"], ["--motion", "drive", "--odom-noise", "1e300", "1"],
+        ["--motion", "drive", "--size", "1e5", "1e5", "--per-kind", "0"],
+    ],
+    ids=lambda options: " ".join(options)[:40],
+)  # fmt: skip
+def test_absurd_values_are_refused_in_one_line(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], options: list[str]
+) -> None:
+    assert console.run(app, "prim-record", [str(tmp_path / "a.mcap"), *options]) == 2
+    err = capsys.readouterr().err
+    assert err.count("\n") == 1 and "bug" not in err and len(err) < 300, err
+
+
 def test_an_output_that_cannot_be_written_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert prim_record(tmp_path / "no" / "a.mcap") == 1
     assert prim_record(tmp_path) == 1

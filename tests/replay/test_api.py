@@ -1,7 +1,9 @@
 """The API: what a replay returns, and errors that name parameters."""
 
+import dataclasses
 import inspect
 import json
+import math
 import typing
 from collections.abc import Callable
 from pathlib import Path
@@ -11,6 +13,7 @@ import numpy as np
 import pytest
 
 import prim
+from mapping.grid import GridFrame, OccupancyGrid
 from recorder.keywords import SWITCHES as RECORDING_SWITCHES
 from recorder.keywords import RecordingKeywords
 from recorder.session import Session
@@ -328,3 +331,32 @@ def test_the_options_of_the_command_line_are_keywords() -> None:
     printed = {"quiet", "verbose", "debug", "version"}
     options = set(inspect.signature(cli.replay).parameters) - outputs - printed
     assert {name.removeprefix("no_") for name in options} == set(ReplayKeywords.__annotations__)
+
+
+@pytest.mark.parametrize("value", [1e300, 1e-300, math.nan, math.inf])
+def test_absurd_values_are_refused(value: float) -> None:
+    for call in (
+        lambda: prim.make_mapper("det", resolution=value),
+        lambda: prim.make_mapper("forward", noise_std=value),
+        lambda: prim.make_mapper("prob", sensor_model="gaussian", noise_std=value),
+        lambda: prim.refine([], [], GRID, noise_std=value),
+        lambda: prim.replay("none.mcap", rate=value),
+        lambda: prim.replay("none.mcap", pose="fused", pose_noise=(value, 1.0)),
+        lambda: prim.replay("none.mcap", pose="fused", odom_noise=(1.0, value)),
+    ):
+        with pytest.raises(prim.UsageError):
+            call()
+
+
+@pytest.mark.parametrize("mapper", ["det", "prob", "forward"])
+@pytest.mark.parametrize("pose", [(1e300, 0.0, 0.0), (math.nan, 0.0, 0.0), (0.0, 0.0, math.inf), (0.0, -1e12, 0.0)])
+def test_growing_maps_refuse_places_that_cannot_be(mapper: str, pose: tuple[float, float, float]) -> None:
+    made = prim.make_mapper(mapper, 0.1)
+    scan = prim.Scan(0, "laser", 0.0, 0.1, 0.1, 5.0, np.ones(9, np.float32))
+    with pytest.raises(prim.UsageError, match="the laser's"):
+        made.update(scan, prim.Pose2D(*pose))
+    with pytest.raises(prim.UsageError, match="the scan cannot be used"):
+        made.update(dataclasses.replace(scan, angle_min=math.nan), prim.Pose2D())
+
+
+GRID = OccupancyGrid(GridFrame(0.1, 0, 0, 4, 4), np.full((4, 4), 0.5, np.float32))

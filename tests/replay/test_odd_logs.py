@@ -19,6 +19,7 @@ from prim.log.messages import (
     SCAN_TYPE,
     encode_odometry,
     encode_point,
+    encode_pose,
     encode_scan,
 )
 from prim.log.writer import LogWriter
@@ -56,7 +57,7 @@ def replay(in_tmp: Path, capsys: pytest.CaptureFixture[str]) -> Replay:
     """Exit code, stderr, report."""
 
     def run(*arguments: object) -> tuple[int, str, dict[str, Any]]:
-        arguments = (*arguments, "--no-viewer", "--mapper", "det", "--report", "r.json")
+        arguments = ("--no-viewer", "--mapper", "det", "--report", "r.json", *arguments)
         code = console.run(app, "prim-replay", [str(argument) for argument in arguments])
         report = json.loads(Path("r.json").read_text()) if code in (0, 3) else {}
         return code, capsys.readouterr().err, report
@@ -245,3 +246,78 @@ def test_messages_counted_in_the_summary_but_missing_are_reported(replay: Replay
     log = write_chunks(Path("a.mcap"), (1, 2, 3), uncounted=2)
     code, err, _ = replay(log, "--standing-still")
     assert (code, "3 messages where the summary counts 5" in err) == (1, True)
+
+
+def odometry(*poses: Pose2D) -> tuple[str, str, list[tuple[int, bytes]]]:
+    stamps = [index * SECOND for index in range(len(poses))]
+    return "/odom", ODOMETRY_TYPE, [(s, encode_odometry(s, pose)) for s, pose in zip(stamps, poses, strict=True)]
+
+
+@pytest.mark.parametrize("value", [1e300, -1e300, math.nan, math.inf])
+def test_poses_that_cannot_be_are_left_out_and_noted(replay: Replay, value: float) -> None:
+    path = write(Path("a.mcap"), [GOOD] * 3, odometry(Pose2D(), Pose2D(), Pose2D(value, 0.0), Pose2D(), Pose2D()))
+    code, err, report = replay(path)
+    assert code == 0 and report["log"]["scans_used"] == 3
+    assert "/odom: 1 poses that are not finite, beyond 1e+09 m, or without a rotation were skipped" in err
+
+
+def test_reports_hold_no_number_that_is_not_finite(replay: Replay) -> None:
+    """Its true poses are 1e200 m away: their errors would be infinite."""
+    poses = [(s * SECOND, encode_pose(s * SECOND, Pose2D(1e200 * (s > 0), 0.0))) for s in range(5)]
+    truth = "/ground_truth/pose", POSE_TYPE, poses
+    path = write(Path("a.mcap"), [GOOD] * 3, odometry(*[Pose2D()] * 5), truth)
+    code, err, _ = replay(path, "--pose", "odom")
+    assert code == 0 and "Warning" not in err
+    json.loads(Path("r.json").read_text(), parse_constant=lambda name: pytest.fail(name))
+
+
+def test_rays_too_long_for_the_map_are_counted(replay: Replay) -> None:
+    far = replace(GOOD, range_max=1e6, ranges=np.where(np.arange(63) < 60, 3e4, 1.0).astype(np.float32))
+    code, err, _ = replay(write(Path("a.mcap"), [far] * 2))
+    assert code == 0
+    assert "120 of 126 rays that returned from a surface are longer than 20972 m (2097152 cells)" in err
+    assert "--max-range" in err
+
+
+def test_a_map_too_large_for_a_logs_ranges_is_the_logs_fault(replay: Replay) -> None:
+    far = replace(GOOD, range_max=1e6, ranges=np.where(np.arange(63) % 16, 1.0, 3e3).astype(np.float32))
+    path = write(Path("a.mcap"), [far])
+    code, err, _ = replay(path)
+    assert code == 1 and "--max-range" in err and "--resolution" in err and err.count("\n") == 1
+    assert replay(path, "--max-range", "5")[0] == 0
+    assert replay(path, "--bounds=-1 -1 1 1")[0] == 0
+    assert replay(path, "--bounds=-3000 -3000 3000 3000")[0] == 2
+
+
+@pytest.mark.parametrize("increment", [math.nan, math.inf, 1e38])
+def test_times_that_cannot_be_do_not_stop_deskewing(replay: Replay, increment: float) -> None:
+    """The first scan says that a sweep takes time; a later one has no such time."""
+    sweeps = [replace(GOOD, time_increment=0.01), replace(GOOD, time_increment=increment)]
+    turning = odometry(*[Pose2D(0.3 * s, 0.0, 0.5 * s) for s in range(5)])
+    code, err, report = replay(write(Path("a.mcap"), sweeps, turning))
+    assert code == 0 and report["log"]["scans_used"] == 2, err
+
+
+@pytest.mark.parametrize("size", ["1e300", "1" + "0" * 400, "[" * 5000 + "]" * 5000])
+def test_absurd_worlds_are_noted_and_not_scored(replay: Replay, size: str) -> None:
+    path = Path("a.mcap")
+    with LogWriter(path) as log:
+        log.add_attachment("world.json", "application/json", f'{{"size": [{size}, 2]}}'.encode(), SECOND)
+        log.add_topic("/scan", SCAN_TYPE)
+        log.write("/scan", SECOND, encode_scan(replace(GOOD, stamp=SECOND)))
+    code, err, report = replay(path, "--standing-still")
+    assert code == 0 and "the map is not scored: its world.json" in err
+    assert report["map"]["scores"] is None
+
+
+@pytest.mark.parametrize("mapper", ["det", "prob", "forward"])
+def test_values_of_all_kinds_are_handled(replay: Replay, mapper: str) -> None:
+    """Each float of a scan and each number of a pose in turn; warnings of numpy are errors in tests."""
+    odd = [math.nan, math.inf, -math.inf, 1e36, -1e36, 1e-38, 0.0]
+    names = ["angle_min", "angle_increment", "range_min", "range_max", "time_increment", "scan_time"]
+    scans = [replace(GOOD, **{name: value}) for name in names for value in odd]
+    scans += [with_ranges(*odd * 9) for _ in range(2)]
+    path = write(Path("a.mcap"), [GOOD, *scans, GOOD])
+    for options in ([], ["--match-scans"], ["--no-deskew", "--max-range", "1e300"]):
+        code, err, _ = replay(path, "--bounds=-2 -2 2 2", "--mapper", mapper, "--resolution", "0.1", *options)
+        assert code == 0 and "Warning" not in err, err

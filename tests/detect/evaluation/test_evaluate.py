@@ -125,7 +125,7 @@ def test_the_papers_report(tmp_path: Path) -> None:
     assert "| det, trained n = 0, tested n = 0 | all | 0.900 (0.800) | 0.900 (0.821) | 0.900 (0.554) |" in text
     assert "| forward, trained n = 0.05, tested n = 0.1 | ellipse | 0.900 |" in text
     assert "0.6 (69.8) | 10.0 (88.1)" in text  # 0.01 rad, 0.01 m
-    lines = list(csv.DictReader(table.open()))
+    lines = list(csv.DictReader(table.read_text("utf-8").splitlines()))
     assert len(lines) == 26 * 6 and float(lines[0]["paper_f1"]) == 0.8 and float(lines[0]["true_box_width"]) == 10
     assert plot.stat().st_size > 10_000
 
@@ -183,7 +183,7 @@ def test_the_shipped_weights_report(tmp_path: Path) -> None:
     markdown, table = tables.write_shipped_report(results, tmp_path)
     row = "| warped | 250 | forward | 500 | 0.900 | 0.900 | 0.900 | 0.900 | 0.450 | 0.300 | 0.900 | 0.900 | – |"
     assert row in markdown.read_text()
-    lines = list(csv.DictReader(table.open()))
+    lines = list(csv.DictReader(table.read_text("utf-8").splitlines()))
     assert len(lines) == 7 + 4 * 3 and {line["recorded"] for line in lines} == set(RecordingMode)
     assert lines[0]["position_mm"] == "" and lines[0]["networks_f1"] == "0.9"
     assert (lines[0]["map50"], lines[0]["weighted_map50"]) == ("0.45", "0.9")
@@ -195,7 +195,7 @@ def test_results_without_the_mean_average_precision_of_what_is_reported_have_a_d
     condition = next(suites.conditions(500))
     markdown, table = tables.write_shipped_report([(condition, "forward", 500, earlier)], tmp_path)
     assert "| 500 | 0.900 | 0.900 | 0.900 | 0.900 | – | – | 0.900 | 0.900 | – |" in markdown.read_text()
-    assert next(csv.DictReader(table.open()))["map50"] == ""
+    assert next(csv.DictReader(table.read_text("utf-8").splitlines()))["map50"] == ""
     assert "| 0 mm | 500 | 0.900 | 0.900 | – | – |" in tables.shipped_summary(
         [(condition, "forward", 500, earlier)], RecordingMode.WARPED, "forward"
     )

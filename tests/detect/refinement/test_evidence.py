@@ -7,16 +7,22 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from detect.refinement.evidence import (
     KindPosterior,
     _merged_special_cases,
+    compare_kinds,
     laplace_evidence,
     log_prior,
     max_size,
 )
 from detect.refinement.fit import SPECIAL_CASES, KindFit
+from detect.refinement.geometry import JACOBIANS
 from detect.refinement.options import DEFAULTS
+from detect.refinement.rays import RayBundle
+from detect.refinement.sensor_model import BeamModel
 from prim.shapes import Kind, Primitive
 
 
@@ -75,3 +81,25 @@ def test_evidence_is_finite_however_much_the_rays_say_of_one_direction(largest: 
         assert laplace_evidence(fit) == pytest.approx(
             expected, abs=8.0
         )  # half of what rounding hides: ln 1e7 at most
+
+
+RAYS = RayBundle(np.zeros((7, 0)), np.zeros(0, np.int8), np.zeros(0), np.zeros(0), np.zeros(0, np.int32))
+SENSOR = BeamModel.create(0.01, 5.0)
+ODD = [0.0, 1.0, -1.0, 1e6, 1e20, 1e300, -1e300, math.nan, math.inf]
+
+
+@settings(max_examples=60, deadline=None)
+@given(
+    st.sampled_from([*Kind]),
+    st.lists(st.sampled_from(ODD), min_size=25, max_size=25),
+    st.sampled_from([0.0, 634.0, math.nan, math.inf, -math.inf, 1e300]),
+)
+def test_degenerate_fits_have_a_finite_posterior_or_none(kind: Kind, entries: list[float], cost: float) -> None:
+    """Whatever the information is: singular, indefinite, not finite."""
+    size = JACOBIANS[kind].shape[1]
+    information = np.array(entries).reshape(5, 5)[:size, :size]
+    with np.errstate(all="ignore"):
+        information = (information + information.T) / 2
+    fit = KindFit(kind, np.array([0.5, 0.5, 0.3, 0.1, 0.1]), cost, information)
+    posterior = compare_kinds([fit], RAYS, SENSOR)
+    assert posterior is None or np.isfinite([*posterior.std.values(), *posterior.covariance.ravel()]).all()

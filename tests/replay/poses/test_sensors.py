@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 
 from prim.errors import LogReadError
-from prim.log import open_log
 from prim.log.messages import (
     FIX_TYPE,
     POINT_TYPE,
@@ -267,5 +266,5 @@ def test_lever_arm_of_the_antenna_is_read_from_tf(tmp_path: Path) -> None:
 
 
 def test_log_without_sensors_has_no_gps_and_no_compass(tmp_path: Path) -> None:
-    with open_log(log_of(tmp_path / "a.mcap", STRAIGHT).path) as log:
+    with log_of(tmp_path / "a.mcap", STRAIGHT) as log:
         assert find_gps(log) is None and find_compass(log) is None
