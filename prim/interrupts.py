@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import signal
+import sys
 import threading
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
@@ -131,3 +132,20 @@ def interrupted_run(error: KeyboardInterrupt, what: str) -> InterruptedRunError:
     """
     exit_code = error.exit_code if isinstance(error, Interruption) else 128 + signal.SIGINT
     return InterruptedRunError(f"interrupted: {what}", exit_code)
+
+
+@contextmanager
+def no_traceback_when_interrupted(name: str) -> Iterator[None]:
+    """End the process by one line where it is interrupted while a command is still being loaded.
+
+    Args:
+        name: The command's name.
+
+    Yields:
+        Nothing.
+    """
+    try:
+        yield
+    except KeyboardInterrupt:
+        sys.stderr.write(f"{name}: error: interrupted\n")
+        raise SystemExit(128 + signal.SIGINT) from None

@@ -173,17 +173,16 @@ def test_a_world_without_room_to_drive_is_refused() -> None:
 
 def killed_recording(folder: Path, seconds: float, seed: int) -> tuple[Path, float]:
     """A recorder that is killed with SIGKILL after writing for so many seconds: its file, and when that was."""
-    part = folder / f"{seed}.mcap.part"
     code = "from recorder.cli import main; main()"
     options = ["--motion", "drive", "--duration", "100000", "--rays", "90", "--seed", str(seed), "--quiet"]
     process = subprocess.Popen([sys.executable, "-c", code, str(folder / f"{seed}.mcap"), *options])
-    while not part.exists() and process.poll() is None:
+    while not (parts := list(folder.glob(f"{seed}.mcap.*.part"))) and process.poll() is None:
         time.sleep(0.01)
     time.sleep(seconds)
     killed = time.time()
     os.kill(process.pid, signal.SIGKILL)
     process.wait()
-    return part, killed
+    return parts[0], killed
 
 
 def check_killed(part: Path, killed: float, seconds: float) -> None:

@@ -1,0 +1,25 @@
+"""The entry points of prim-train and prim-eval, and of ``python -m detect``: nothing is loaded before an interruption would end it by one line."""
+
+from __future__ import annotations
+
+from prim.interrupts import no_traceback_when_interrupted
+
+
+def main() -> None:
+    """Run prim-train."""
+    with no_traceback_when_interrupted("prim-train"):
+        from detect.cli import main as run
+
+        run()
+
+
+def main_eval() -> None:
+    """Run prim-eval."""
+    with no_traceback_when_interrupted("prim-eval"):
+        from detect.cli import main_eval as run
+
+        run()
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,17 @@
+"""The entry point of prim-replay, and of ``python -m replay``: nothing is loaded before an interruption would end it by one line."""
+
+from __future__ import annotations
+
+from prim.interrupts import no_traceback_when_interrupted
+
+
+def main() -> None:
+    """Run prim-replay."""
+    with no_traceback_when_interrupted("prim-replay"):
+        from replay.cli import main as run
+
+        run()
+
+
+if __name__ == "__main__":
+    main()
