@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
-from urllib.parse import quote
 
 import numpy as np
 import rerun as rr
@@ -35,7 +34,7 @@ from replay.viewer_layout import (
     blueprint,
     layers,
 )
-from replay.viewing.checks import check_display, check_viewer, create_partial, find_free_port, partial_path
+from replay.viewing.checks import check_display, check_viewer, create_partial, local_address, partial_path
 from replay.viewing.drawing import (
     confidence_ellipse,
     crop_sheet,
@@ -48,6 +47,7 @@ from replay.viewing.drawing import (
 from replay.viewing.markdown import detections_markdown, summary_markdown
 from replay.viewing.protocol import Scene, ViewerOptions
 from replay.viewing.scan_batch import ScanBatch, ScanEntry
+from replay.viewing.serving import RecordingServer
 
 if TYPE_CHECKING:
     from detect.detection import Detection
@@ -60,8 +60,8 @@ TRAJECTORY_POINTS = 2000
 TRAJECTORY_HEIGHT, SCAN_HEIGHT, TRUTH_HEIGHT, DETECTION_HEIGHT = 0.0004, 0.0008, 0.0012, 0.0016
 """Heights above the map, as shares of its size: enough to keep what is drawn on it from flickering."""
 
-GRPC_PORT, WEB_PORT = 9876, 9090
-"""Where ``--serve`` serves the recording and the viewer, or at the next ports that are free."""
+SERVE_HOST = "127.0.0.1"
+"""Where ``--serve`` listens by default: only this machine reaches it."""
 
 FLUSH_SECONDS = 60.0
 """How long the rest of a recording may take to be written or sent (s)."""
@@ -91,7 +91,8 @@ class RerunViewer:
         announce: Called with the addresses of a replay that is served.
 
     Raises:
-        UsageError: A viewer is to be opened, and there is no display; or a URL is not one of a viewer.
+        UsageError: A viewer is to be opened, and there is no display; or a URL is not one of a viewer; or a host is
+            none of this machine.
         ViewerUnreachableError: No viewer answers at the URL.
     """
 
@@ -102,8 +103,11 @@ class RerunViewer:
             check_display()
         if options.connect is not None:
             check_viewer(options.connect)
+        if options.serve:
+            local_address(options.serve_host or SERVE_HOST)
         self._options = options
         self._announce = announce
+        self._server: RecordingServer | None = None
         self._recording = rr.RecordingStream(APPLICATION)
         self._recording.set_log_time_enabled(False)
         self._batch = ScanBatch(options.live, options.watched)
@@ -220,14 +224,15 @@ class RerunViewer:
             self._recording.flush(timeout_sec=FLUSH_SECONDS)
         except Exception as error:  # rerun raises plain RuntimeErrors
             raise RecordingError(f"the recording could not be written in full: {error}") from error
-        if not self._options.serve:
-            self._recording.disconnect()
+        self._recording.disconnect()  # a server keeps what it was sent
         if self._options.save is not None:
             partial_path(self._options.save).replace(self._options.save)
 
     def abandon(self) -> None:
         """Close the recording and remove its file; an earlier recording of that name stays as it was."""
         self._recording.disconnect()
+        if self._server is not None:
+            self._server.close()
         if self._options.save is not None:
             partial_path(self._options.save).unlink(missing_ok=True)
 
@@ -245,13 +250,17 @@ class RerunViewer:
         if options.connect is not None:
             sinks.append(rr.GrpcSink(options.connect))
         if options.serve:
-            url = self._recording.serve_grpc(grpc_port=find_free_port(GRPC_PORT))
-            port = find_free_port(WEB_PORT)
-            rr.serve_web_viewer(web_port=port, open_browser=False, connect_to=url)
-            self._announce(f"browse: http://localhost:{port}/?url={quote(url, safe='')}")
-            self._announce(f"or:     rerun {url}")
-        elif sinks:
+            sinks.append(rr.GrpcSink(self._serve(options.serve_host or SERVE_HOST)))
+        if sinks:
             self._recording.set_sinks(*sinks)
+
+    def _serve(self, host: str) -> str:
+        """Start the server that browsers connect to, and return where the recording is sent."""
+        self._server = RecordingServer(host)
+        page, url = self._server.addresses.announced
+        self._announce(f"browse: {page}")
+        self._announce(f"or:     rerun {url}")
+        return self._server.addresses.recording
 
     def _set_time(self, position: int, stamp: int) -> None:
         self._recording.set_time(STAMP, timestamp=np.datetime64(stamp, "ns"))

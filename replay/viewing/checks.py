@@ -45,13 +45,39 @@ def check_viewer(url: str) -> None:
         raise ViewerUnreachableError(f"no viewer answers at {url}: {error}; start one there with: rerun") from error
 
 
-def find_free_port(first: int) -> int:
-    """Return the first port from ``first`` on that nothing listens on. Raises UsageError where there is none."""
+def local_address(host: str) -> str:
+    """Return the IP address of a host of this machine, IPv4 where it has one. Raises UsageError for other hosts."""
+    try:
+        found = socket.getaddrinfo(host, None, type=socket.SOCK_STREAM)
+        family, *_, place = min(found, key=lambda entry: entry[0] != socket.AF_INET)
+        with socket.socket(family) as probe:
+            probe.bind(place)
+    except (OSError, ValueError) as error:
+        raise UsageError(
+            f"--serve-host {host}: not an address of this machine ({error}); 0.0.0.0 is every address"
+        ) from error
+    return str(place[0])
+
+
+def find_free_port(first: int, address: str) -> int:
+    """Find a port that nothing listens on.
+
+    Args:
+        first: Where to begin.
+        address: The IP address.
+
+    Returns:
+        The first free port from there on.
+
+    Raises:
+        UsageError: There is none.
+    """
+    family = socket.AF_INET6 if ":" in address else socket.AF_INET
     for port in range(first, first + PORTS_TRIED):
-        with socket.socket() as probe:
+        with socket.socket(family) as probe:
             probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
             try:
-                probe.bind(("", port))
+                probe.bind((address, port))
             except OSError:
                 continue
             return port
