@@ -103,8 +103,9 @@ class RerunViewer:
             check_display()
         if options.connect is not None:
             check_viewer(options.connect)
+        self._serve_host = SERVE_HOST if options.serve_host is None else options.serve_host
         if options.serve:
-            local_address(options.serve_host or SERVE_HOST)
+            local_address(self._serve_host)
         self._options = options
         self._announce = announce
         self._server: RecordingServer | None = None
@@ -250,13 +251,13 @@ class RerunViewer:
         if options.connect is not None:
             sinks.append(rr.GrpcSink(options.connect))
         if options.serve:
-            sinks.append(rr.GrpcSink(self._serve(options.serve_host or SERVE_HOST)))
+            sinks.append(rr.GrpcSink(self._serve()))
         if sinks:
             self._recording.set_sinks(*sinks)
 
-    def _serve(self, host: str) -> str:
+    def _serve(self) -> str:
         """Start the server that browsers connect to, and return where the recording is sent."""
-        self._server = RecordingServer(host)
+        self._server = RecordingServer(self._serve_host)
         page, url = self._server.addresses.announced
         self._announce(f"browse: {page}")
         self._announce(f"or:     rerun {url}")

@@ -20,10 +20,10 @@ from typing import IO
 from urllib.parse import quote
 
 from prim.errors import PrimError
-from replay.viewing.checks import PORTS_TRIED, find_free_port, local_address
+from replay.viewing.checks import PORTS_TRIED, find_free_ports, local_address
 
-GRPC_PORT, WEB_PORT = 9876, 9090
-"""Where the recording and the viewer are served, or at the next ports that are free."""
+PORTS = 9876, 9090
+"""Where the recording and the viewer's page are served, or at the next ports that are both free."""
 
 START_SECONDS = 30.0
 """The server must listen within this time (s); set by hand, it takes some tenths of a second."""
@@ -125,7 +125,7 @@ class RecordingServer:
             if process.listens:
                 break
             failed, self.addresses = self.addresses, _free_addresses(address)
-            if failed == self.addresses:
+            if failed == self.addresses:  # else another program was faster
                 raise ServingError(f"--serve: rerun's server did not start: {process.report}")
         self.close = weakref.finalize(self, process.end)
         """End the server; called by itself where it has not been."""
@@ -136,10 +136,11 @@ class _ServerProcess:
 
     def __init__(self, addresses: ServedAddresses) -> None:
         self.listens = False
-        self.report = f"it does not listen after {START_SECONDS:.0f} s"
+        self.report = ""
+        self._started = threading.Event()
         environment = {name: value for name, value in os.environ.items() if name != FORCED} | SETTINGS
         try:
-            process = subprocess.Popen(
+            self._process = subprocess.Popen(
                 _command(addresses),
                 stdin=subprocess.DEVNULL,
                 stdout=subprocess.PIPE,
@@ -152,28 +153,38 @@ class _ServerProcess:
             )
         except OSError as error:
             raise ServingError(f"--serve: rerun's server did not start: {error}") from error
-        started = threading.Event()
-        reader = threading.Thread(target=self._read, args=(process.stdout, started), daemon=True)
-        self.end = weakref.finalize(self, _kill, process, reader)
-        reader.start()
-        started.wait(START_SECONDS)
-        if not self.listens:
-            self.end()
+        try:
+            self._await()
+        finally:
+            if not self.listens:
+                self.end()
 
-    def _read(self, output: IO[str], started: threading.Event) -> None:
+    def end(self) -> None:
+        """End the server."""
+        self._process.kill()
+        self._process.wait()
+
+    def _await(self) -> None:
+        """Wait until the server listens or has failed."""
+        threading.Thread(target=self._read, args=(self._process.stdout,), daemon=True).start()
+        if not self._started.wait(START_SECONDS):
+            self.report = f"it does not listen after {START_SECONDS:.0f} s"
+
+    def _read(self, output: IO[str]) -> None:
         """Read what the server writes, to the end: it would wait for a reader otherwise."""
-        for line in output:
-            if LISTENING in line:
-                self.listens = True
-                started.set()
-            elif (text := PREFIX.sub("", ESCAPES.sub("", line)).strip()) and not self.listens:
-                self.report = text
-        started.set()
+        with output:
+            for line in output:
+                if LISTENING in line:
+                    self.listens = True
+                    self._started.set()
+                elif text := PREFIX.sub("", ESCAPES.sub("", line)).strip():
+                    self.report = text
+        self.report = self.report or "it ended at once"
+        self._started.set()
 
 
 def _free_addresses(address: str) -> ServedAddresses:
-    grpc_port = find_free_port(GRPC_PORT, address)
-    return ServedAddresses(address, grpc_port, find_free_port(WEB_PORT, address))
+    return ServedAddresses(address, *find_free_ports(PORTS, address))
 
 
 def _command(addresses: ServedAddresses) -> list[str]:
@@ -195,13 +206,6 @@ def _executable() -> Path:
     if not found:
         raise ServingError("--serve needs the executable that rerun-sdk brings, and it is missing: install it anew")
     return found[0]
-
-
-def _kill(process: subprocess.Popen[str], reader: threading.Thread) -> None:
-    """Kill a process, and wait for the thread that reads what it writes."""
-    process.kill()
-    process.wait()
-    reader.join()
 
 
 def _outward_address() -> list[str]:
