@@ -1,4 +1,4 @@
-"""The entry points of prim-train and prim-eval, and of ``python -m detect``: nothing is loaded before an interruption would end it by one line."""
+"""The entry points of prim-train and prim-eval, and of ``python -m detect``."""
 
 from __future__ import annotations
 

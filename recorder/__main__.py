@@ -1,4 +1,4 @@
-"""The entry point of prim-record, and of ``python -m recorder``: nothing is loaded before an interruption would end it by one line."""
+"""The entry point of prim-record, and of ``python -m recorder``."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The entry point of prim-replay, and of ``python -m replay``: nothing is loaded before an interruption would end it by one line."""
+"""The entry point of prim-replay, and of ``python -m replay``."""
 
 from __future__ import annotations
 

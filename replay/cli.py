@@ -140,7 +140,15 @@ def replay(
     connect: Annotated[
         str | None, typer.Option(metavar="URL", help="Show the replay in a viewer that runs at URL.")
     ] = None,
-    serve: Annotated[bool, typer.Option("--serve", help="Serve the replay to web browsers.")] = False,
+    serve: Annotated[bool, typer.Option("--serve", help="Serve the replay to web browsers on this machine.")] = False,
+    serve_host: Annotated[
+        str | None,
+        typer.Option(
+            metavar="HOST",
+            help="With --serve: listen on this address of this machine; 0.0.0.0 lets every machine of the network "
+            "watch. [default: 127.0.0.1]",
+        ),
+    ] = None,
     no_viewer: Annotated[
         bool, typer.Option("--no-viewer", help="Make no rerun recording, and detect primitives at the end only.")
     ] = False,
@@ -178,7 +186,7 @@ def replay(
     from replay.keywords import replay_options
     from replay.viewing.protocol import ViewerOptions
 
-    viewer = ViewerOptions(save, spawn, connect, serve, live=rate is not None, force=force)
+    viewer = ViewerOptions(save, spawn, connect, serve, live=rate is not None, force=force, serve_host=serve_host)
     if no_viewer and (viewer != ViewerOptions(live=viewer.live, force=force) or map_every):
         raise UsageError("--no-viewer excludes --save, --spawn, --connect, --serve and --map-every")
     options = replay_options(

@@ -7,7 +7,6 @@ import struct
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
-from urllib.parse import quote
 
 import numpy as np
 from numpy.typing import NDArray
@@ -40,7 +39,7 @@ from replay.viewer_layout import (
     blueprint,
     layers,
 )
-from replay.viewing.checks import check_display, check_viewer, find_free_port
+from replay.viewing.checks import check_display, check_viewer, local_address
 from replay.viewing.drawing import (
     confidence_ellipse,
     crop_sheet,
@@ -53,6 +52,7 @@ from replay.viewing.drawing import (
 from replay.viewing.markdown import detections_markdown, summary_markdown
 from replay.viewing.protocol import Scene, ViewerOptions
 from replay.viewing.scan_batch import ScanBatch, ScanEntry
+from replay.viewing.serving import RecordingServer
 
 with environment(RUST_LOG="off"):  # see replay.viewer_layout
     import rerun as rr
@@ -69,8 +69,8 @@ TRAJECTORY_POINTS = 2000
 TRAJECTORY_HEIGHT, SCAN_HEIGHT, TRUTH_HEIGHT, DETECTION_HEIGHT = 0.0004, 0.0008, 0.0012, 0.0016
 """Heights above the map, as shares of its size: enough to keep what is drawn on it from flickering."""
 
-GRPC_PORT, WEB_PORT = 9876, 9090
-"""Where ``--serve`` serves the recording and the viewer, or at the next ports that are free."""
+SERVE_HOST = "127.0.0.1"
+"""Where ``--serve`` listens by default: only this machine reaches it."""
 
 FLUSH_SECONDS = 60.0
 """How long the rest of a recording may take to be written or sent (s)."""
@@ -100,7 +100,8 @@ class RerunViewer:
         announce: Called with the addresses of a replay that is served.
 
     Raises:
-        UsageError: A viewer is to be opened, and there is no display; or a URL is not one of a viewer.
+        UsageError: A viewer is to be opened, and there is no display; or a URL is not one of a viewer; or a host is
+            none of this machine.
         ViewerUnreachableError: No viewer answers at the URL.
     """
 
@@ -111,9 +112,13 @@ class RerunViewer:
             check_display()
         if options.connect is not None:
             check_viewer(options.connect)
+        self._serve_host = SERVE_HOST if options.serve_host is None else options.serve_host
+        if options.serve:
+            local_address(self._serve_host)
         self._options = options
         self._announce = announce
         self._output: OutputFile | None = None
+        self._server: RecordingServer | None = None
         self._recording = rr.RecordingStream(APPLICATION)
         self._recording.set_log_time_enabled(False)
         self._batch = ScanBatch(options.live, options.watched)
@@ -236,8 +241,7 @@ class RerunViewer:
         except Exception as error:  # rerun raises plain RuntimeErrors
             self.abandon()
             raise RecordingError(f"the recording could not be written in full: {printable(str(error))}") from error
-        if not self._options.serve:
-            self._recording.disconnect()
+        self._recording.disconnect()  # a server keeps what it was sent
         if self._output is not None:
             _check_whole(self._output)
             self._output.commit()
@@ -245,6 +249,8 @@ class RerunViewer:
     def abandon(self) -> None:
         """Close the recording and remove its file; an earlier recording of that name stays as it was."""
         self._recording.disconnect()
+        if self._server is not None:
+            self._server.close()
         if self._output is not None:
             self._output.discard()
 
@@ -263,13 +269,17 @@ class RerunViewer:
         if options.connect is not None:
             sinks.append(rr.GrpcSink(options.connect))
         if options.serve:
-            url = self._recording.serve_grpc(grpc_port=find_free_port(GRPC_PORT))
-            port = find_free_port(WEB_PORT)
-            rr.serve_web_viewer(web_port=port, open_browser=False, connect_to=url)
-            self._announce(f"browse: http://localhost:{port}/?url={quote(url, safe='')}")
-            self._announce(f"or:     rerun {url}")
-        elif sinks:
+            sinks.append(rr.GrpcSink(self._serve()))
+        if sinks:
             self._recording.set_sinks(*sinks)
+
+    def _serve(self) -> str:
+        """Start the server that browsers connect to, and return where the recording is sent."""
+        self._server = RecordingServer(self._serve_host)
+        page, url = self._server.addresses.announced
+        self._announce(f"browse: {page}")
+        self._announce(f"or:     rerun {url}")
+        return self._server.addresses.recording
 
     def _set_time(self, position: int, stamp: int) -> None:
         self._recording.set_time(STAMP, timestamp=np.datetime64(stamp, "ns"))

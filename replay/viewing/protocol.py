@@ -29,9 +29,11 @@ class ViewerOptions:
         serve: Web browsers.
         force: The file may replace one that is no earlier recording of prim.
         live: Every scan is sent at once, as a replay that is held to a rate wants it.
+        serve_host: The address or the name of this machine that browsers are served on; None for 127.0.0.1, which
+            only this machine reaches.
 
     Raises:
-        UsageError: Two of them exclude each other.
+        UsageError: Two of them exclude each other, or one needs another.
     """
 
     save: Path | None = None
@@ -40,10 +42,13 @@ class ViewerOptions:
     serve: bool = False
     live: bool = False
     force: bool = False
+    serve_host: str | None = None
 
     def __post_init__(self) -> None:
         if self.serve and (self.save or self.spawn or self.connect):
             raise UsageError("--serve excludes --save, --spawn and --connect")
+        if self.serve_host is not None and not self.serve:
+            raise UsageError("--serve-host goes with --serve")
         if self.spawn and self.connect:
             raise UsageError("--spawn and --connect exclude each other")
 
