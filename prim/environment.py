@@ -13,6 +13,9 @@ def environment(**defaults: str) -> Iterator[None]:
 
     Args:
         **defaults: Their values by name.
+
+    Yields:
+        Nothing.
     """
     added = {name: value for name, value in defaults.items() if name not in os.environ}
     os.environ.update(added)

@@ -129,6 +129,9 @@ def interrupted_run(error: KeyboardInterrupt, what: str) -> InterruptedRunError:
     Args:
         error: What interrupted it.
         what: What is left of it.
+
+    Returns:
+        The error.
     """
     exit_code = error.exit_code if isinstance(error, Interruption) else 128 + signal.SIGINT
     return InterruptedRunError(f"interrupted: {what}", exit_code)

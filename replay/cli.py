@@ -396,9 +396,7 @@ def _replay_log(log: Path, outputs: OutputFiles, run: Run) -> int:
     with run.interrupts.held():
         written, errors = _write_outputs(results, viewer, outputs)
         if not run.verbosity.quiet:
-            _print_results(results, written, run.verbosity.verbose)
-            if replaced:
-                console.echo("replaced: " + ", ".join(str(path) for path in replaced if path in written))
+            _print_results(results, written, replaced, run.verbosity.verbose)
         for error in errors[1:]:
             console.print_error("prim-replay", error, run.verbosity.debug)
         if errors:
@@ -455,8 +453,10 @@ def _write_outputs(
     return written, errors
 
 
-def _print_results(results: Sequence[ReplayResult], written: Sequence[Path], verbose: bool) -> None:
-    """Print notes, rejected candidates if ``verbose``, the table, and where the outputs are."""
+def _print_results(
+    results: Sequence[ReplayResult], written: Sequence[Path], replaced: Sequence[Path], verbose: bool
+) -> None:
+    """Print notes, rejected candidates if ``verbose``, the table, where the outputs are, and which were replaced."""
     from replay.result import distinct_notes
 
     for note in distinct_notes(results):
@@ -465,8 +465,9 @@ def _print_results(results: Sequence[ReplayResult], written: Sequence[Path], ver
         for result in results:
             _print_rejected(result)
     _print_tables(results, verbose)
-    if written:
-        console.echo("wrote: " + ", ".join(str(path) for path in written))
+    for name, paths in (("wrote", written), ("replaced", [path for path in replaced if path in written])):
+        if paths:
+            console.echo(f"{name}: " + ", ".join(map(str, paths)))
     for path in written:
         if path.suffix == ".rrd":
             console.echo(f"open:  rerun {shlex.quote(str(path))}")

@@ -20,8 +20,15 @@ RECORDING = ResultFormat(
     "a recording of prim", re.compile(rb"RRF2.{0,200}\x1a\x06\x0a\x04" + APPLICATION.encode(), re.DOTALL)
 )
 REPORT = ResultFormat("a report of prim-replay", re.compile(rb'\s*{\s*"schema": "prim-replay/'))
-MAP_IMAGE = ResultFormat("a map of prim-replay", re.compile(rb"P5\n# prim-replay\n"))
-MAP_DESCRIPTION = ResultFormat("a map of prim-replay", re.compile(rb"# prim-replay\n"))
+MAP_IMAGE = ResultFormat("a map of prim-replay", re.compile(rb"P5\n\d+  \d+\n255\n"))
+"""Other programs write one blank between the sides of the image; a comment would trip simple readers."""
+MAP_DESCRIPTION = ResultFormat(
+    "a map of prim-replay",
+    re.compile(
+        rb"image: [^\n]*\nmode: trinary\nresolution: [^\n]*\norigin: [^\n]*\nnegate: 0\n"
+        rb"occupied_thresh: 0\.65\nfree_thresh: 0\.196\n\Z"
+    ),
+)
 TRAJECTORY = ResultFormat(
     "a trajectory of prim-replay", re.compile(rb"\d+\.\d{9}( -?\d+\.\d{9}){2} 0 0 0( -?\d\.\d{9}){2}\n")
 )
@@ -60,12 +67,12 @@ def write_map(stem: Path, grid: OccupancyGrid, force: bool = False) -> None:
     x, y = frame.origin
     name = pgm.name if re.fullmatch(r"[\w.-]+", pgm.name) else strict_json.dumps(pgm.name)  # quoted as YAML has it
     description = (
-        f"# prim-replay\nimage: {name}\nmode: trinary\n"
+        f"image: {name}\nmode: trinary\n"
         f"resolution: {frame.resolution:g}\norigin: [{x:.9g}, {y:.9g}, 0]\nnegate: 0\n"
         f"occupied_thresh: {OCCUPIED_THRESHOLD}\nfree_thresh: {FREE_THRESHOLD}\n"
     )
     pixels = np.flipud(image).tobytes()
-    write_file(pgm, f"P5\n# prim-replay\n{cols} {rows}\n255\n".encode() + pixels, MAP_IMAGE, force)
+    write_file(pgm, f"P5\n{cols}  {rows}\n255\n".encode() + pixels, MAP_IMAGE, force)
     write_file(yaml, description.encode(), MAP_DESCRIPTION, force)
 
 

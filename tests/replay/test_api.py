@@ -210,7 +210,7 @@ def test_of_guesses_that_overlap_the_first_is_fitted(quiet_session: Session) -> 
 def test_a_recording_is_never_saved_over_the_log(noisy_session: Session, tmp_path: Path) -> None:
     log = tmp_path / "log.mcap"
     log.write_bytes(noisy_session.path.read_bytes())
-    with pytest.raises(prim.UsageError, match="is a log: it cannot be an output as well"):
+    with pytest.raises(prim.UsageError, match="is the input"):
         prim.replay(log, save=tmp_path / "." / "log.mcap")
     assert log.read_bytes() == noisy_session.path.read_bytes()
 
@@ -328,6 +328,7 @@ def test_switches_are_the_keywords_that_are_true_or_false() -> None:
 def test_the_options_of_the_command_line_are_keywords() -> None:
     """All but those that say where outputs go, and what is printed."""
     outputs = {"logs", "save", "spawn", "connect", "serve", "no_viewer", "report", "map_output", "trajectory"}
+    outputs |= {"context", "serve_host", "force"}
     printed = {"quiet", "verbose", "debug", "version"}
     options = set(inspect.signature(cli.replay).parameters) - outputs - printed
     assert {name.removeprefix("no_") for name in options} == set(ReplayKeywords.__annotations__)

@@ -237,18 +237,20 @@ def test_an_unreadable_log_does_not_stop_the_others(replay: Run, noisy_session: 
 def test_no_output_overwrites_a_log(replay: Run, noisy_session: Session, option: str) -> None:
     before = noisy_session.path.read_bytes()
     code, _, err = replay(noisy_session.path, option, noisy_session.path)
-    assert (code, "is a log" in err) == (2, True)
+    assert (code, "is the input" in err) == (2, True)
     assert noisy_session.path.read_bytes() == before
     assert replay(noisy_session.path, "--report", "same", option, "same")[0] == (0 if option == "--report" else 2)
 
 
 def test_a_replay_that_fails_keeps_the_earlier_recording(replay: Run, noisy_session: Session) -> None:
-    Path("a.rrd").write_text("earlier")
+    assert replay(noisy_session.path, "--save", "a.rrd", "--no-detect", "--report", "a.json")[0] == 0
+    Path("a.json").unlink()
+    earlier = Path("a.rrd").read_bytes()
     data = bytearray(noisy_session.path.read_bytes())
     data[len(data) // 2] ^= 0xFF
     Path("bad.mcap").write_bytes(data)
     assert replay("bad.mcap", "--save", "a.rrd")[0] == 1
-    assert Path("a.rrd").read_text() == "earlier"
+    assert Path("a.rrd").read_bytes() == earlier
     assert {path.name for path in Path().iterdir()} == {"a.rrd", "bad.mcap"}
 
 

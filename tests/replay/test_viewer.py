@@ -30,7 +30,9 @@ SCREENSHOT = Path(__file__).parents[2] / "docs" / "screenshot.py"
 
 def replayed(log: Path, path: Path, **options: Any) -> ReplayResult:
     viewer = RerunViewer(ViewerOptions(save=path), announce=print)
-    return Pipeline(log, ReplayOptions(**options), viewer).run()
+    result = Pipeline(log, ReplayOptions(**options), viewer).run()
+    viewer.finish([result])
+    return result
 
 
 def rows_of(path: Path) -> dict[str, list[dict[str, Any]]]:
@@ -149,7 +151,8 @@ def test_fused_poses_are_drawn_with_their_uncertainty(noisy_session: Session, tm
 
 def test_a_paced_selection_is_drawn_completely(noisy_session: Session, tmp_path: Path) -> None:
     viewer = RerunViewer(ViewerOptions(save=tmp_path / "a.rrd", live=True), announce=print)
-    Pipeline(noisy_session.path, ReplayOptions(selection=Selection(n_scans=4), rate=100.0), viewer).run()
+    options = ReplayOptions(selection=Selection(n_scans=4), rate=100.0)
+    viewer.finish([Pipeline(noisy_session.path, options, viewer).run()])
     assert len(timed(rows_of(tmp_path / "a.rrd")["/map/scan"])) == 4
 
 
@@ -160,6 +163,7 @@ def comparison(
     path = tmp_path_factory.mktemp("rrd") / "several.rrd"
     viewer = RerunViewer(ViewerOptions(save=path), announce=print)
     results = Pipeline(noisy_session.path, ReplayOptions(mapper="det,prob,forward"), viewer).run_each()
+    viewer.finish(results)
     return path, {result.options.mapper: result for result in results}
 
 

@@ -55,7 +55,10 @@ def detector(noisy_session: Session, monkeypatch: pytest.MonkeyPatch) -> FakeDet
 
 def replayed(session: Session, viewer: RerunViewer | None = None, **options: object) -> ReplayResult:
     chosen = ReplayOptions(weights=Path("w"), **{"refine": False} | options)  # type: ignore[arg-type]
-    return Pipeline(session.path, chosen, viewer).run()
+    result = Pipeline(session.path, chosen, viewer).run()
+    if viewer is not None:
+        viewer.finish([result])
+    return result
 
 
 @pytest.mark.parametrize("mapper", MAPPERS)

@@ -1,0 +1,61 @@
+import os
+import signal
+from collections.abc import Iterator
+
+import pytest
+
+from prim.interrupts import Interruption, Interrupts
+
+
+def interrupt(number: int = signal.SIGINT) -> None:
+    os.kill(os.getpid(), number)
+
+
+def test_an_interruption_names_its_exit_code() -> None:
+    for number, code in ((signal.SIGINT, 130), (signal.SIGTERM, 143)):
+        with Interrupts() as interrupts, pytest.raises(Interruption) as error:
+            interrupt(number)
+        assert error.value.exit_code == interrupts.exit_code == code
+
+
+def test_the_handlers_are_restored() -> None:
+    before = [signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)]
+    with Interrupts():
+        pass
+    assert [signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)] == before
+
+
+def test_an_interruption_is_held_back_until_the_end() -> None:
+    done = []
+    with Interrupts() as interrupts, pytest.raises(Interruption), interrupts.held():
+        interrupt()
+        done.append("all")
+    assert done == ["all"]
+
+
+def test_a_second_interruption_ends_at_once() -> None:
+    with Interrupts() as interrupts, pytest.raises(Interruption), interrupts.held():
+        interrupt()
+        interrupt()
+        pytest.fail("the second one was held back as well")
+
+
+def test_interruptions_come_while_the_next_item_is_made() -> None:
+    def items() -> Iterator[int]:
+        yield 1
+        interrupt()
+        pytest.fail("it was held back")
+
+    seen = []
+    with Interrupts() as interrupts, pytest.raises(Interruption), interrupts.held():
+        seen += list(interrupts.released_while_iterating(items()))
+    with Interrupts() as interrupts, interrupts.held():
+        seen = list(interrupts.released_while_iterating([1, 2, 3]))
+    assert seen == [1, 2, 3]
+
+
+def test_inactive_interrupts_change_nothing() -> None:
+    interrupts = Interrupts()
+    with pytest.raises(KeyboardInterrupt), interrupts.held():
+        interrupt()
+    assert interrupts.exit_code is None

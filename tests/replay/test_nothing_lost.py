@@ -1,0 +1,223 @@
+"""What the commands leave when they are interrupted, killed, run side by side, or find no place on the disk."""
+
+import json
+import os
+import re
+import signal
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from prim.log import open_log
+from recorder.session import Session
+
+ROOT = Path(__file__).parents[2]
+
+LIMIT = "import resource; resource.setrlimit(resource.RLIMIT_FSIZE, ({0}, {0}))\n"
+
+
+def command(part: str, *arguments: object, before: str = "") -> list[str]:
+    code = f"import sys; sys.path.insert(0, {str(ROOT)!r})\n{before}from {part}.__main__ import main; main()"
+    return [sys.executable, "-c", code, *map(str, arguments)]
+
+
+def run(
+    folder: Path, part: str, *arguments: object, before: str = "", **options: object
+) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(  # type: ignore[call-overload,no-any-return]
+        command(part, *arguments, before=before), cwd=folder, capture_output=True, text=True, **options
+    )
+
+
+def is_whole(recording: Path) -> bool:
+    return recording.read_bytes()[-12:-4] == b"RRF2FOOT"
+
+
+def interrupted(folder: Path, log: Path, number: int, *options: str) -> tuple[int, str]:
+    """Interrupt a replay that is held to a slow rate, when some scans are mapped: exit code and stderr."""
+    arguments = [log, "--rate", "0.05", *options]
+    process = subprocess.Popen(command("replay", *arguments), cwd=folder, stderr=subprocess.PIPE, text=True)
+    while not list(folder.glob("*.rrd.*.part")) and process.poll() is None:
+        time.sleep(0.02)
+    time.sleep(2.5)
+    process.send_signal(number)
+    return process.wait(30), process.communicate()[1]
+
+
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+def test_an_interrupted_replay_keeps_what_was_made(
+    tmp_path: Path, noisy_session: Session, number: int, code: int
+) -> None:
+    exit_code, error = interrupted(tmp_path, noisy_session.path, number, "--map", "m")
+    assert exit_code == code, error
+    report = json.loads((tmp_path / "noisy.prob.report.json").read_text())
+    assert report["interrupted"] is True
+    assert 0 < report["log"]["scans_used"] < report["log"]["scans"]
+    assert is_whole(tmp_path / "noisy.prob.rrd")
+    names = {"m.pgm", "m.yaml", "noisy.prob.report.json", "noisy.prob.rrd"}
+    assert {path.name for path in tmp_path.iterdir()} == names
+    assert re.search(r"note: interrupted after \d+ of \d+ scans", error)
+    assert "Traceback" not in error
+
+
+def test_an_interrupted_replay_leaves_earlier_results(tmp_path: Path, noisy_session: Session) -> None:
+    assert run(tmp_path, "replay", noisy_session.path).returncode == 0
+    before = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
+    exit_code, error = interrupted(tmp_path, noisy_session.path, signal.SIGINT)
+    assert exit_code == 130
+    assert "earlier results stay as they are" in error
+    assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == before
+
+
+def test_recorders_and_replays_side_by_side_damage_nothing(tmp_path: Path) -> None:
+    records = [command("recorder", "a.mcap", "--stops", "4", "4", "--seed", seed) for seed in range(3)]
+    for process in [subprocess.Popen(record, cwd=tmp_path, stdout=subprocess.DEVNULL) for record in records]:
+        assert process.wait() == 0
+    with open_log(tmp_path / "a.mcap") as log:
+        assert log.topics["/scan"].messages > 5
+    replays = [command("replay", "a.mcap", "--quiet", "--no-detect") for _ in range(3)]
+    for process in [subprocess.Popen(replay, cwd=tmp_path) for replay in replays]:
+        assert process.wait() == 0
+    assert is_whole(tmp_path / "a.prob.rrd")
+    assert json.loads((tmp_path / "a.prob.report.json").read_text())["interrupted"] is False
+    assert len(list(tmp_path.iterdir())) == 3
+
+
+def test_a_disk_that_is_full_costs_only_what_does_not_fit(tmp_path: Path, noisy_session: Session) -> None:
+    """With little room the recording fails, and the report is written; an earlier recording stays."""
+    options = [noisy_session.path, "--no-detect", "--trajectory", "t.tum"]
+    assert run(tmp_path, "replay", *options).returncode == 0
+    before = (tmp_path / "noisy.prob.rrd").read_bytes()
+    (tmp_path / "noisy.prob.report.json").unlink()
+    for room in (len(before) - 500, 30_000):
+        found = run(tmp_path, "replay", *options, before=LIMIT.format(room))
+        assert found.returncode == 1
+        assert found.stderr.splitlines()[-1].startswith("prim-replay: error: ")
+        assert "the recording could not be written in full" in found.stderr
+        assert "\x1b" not in found.stderr
+        assert (tmp_path / "noisy.prob.rrd").read_bytes() == before
+        assert json.loads((tmp_path / "noisy.prob.report.json").read_text())["interrupted"] is False
+    assert {path.name for path in tmp_path.iterdir()} == {"noisy.prob.rrd", "noisy.prob.report.json", "t.tum"}
+
+
+def test_a_recorder_on_a_full_disk_leaves_the_earlier_log(tmp_path: Path) -> None:
+    assert run(tmp_path, "recorder", "a.mcap").returncode == 0
+    before = (tmp_path / "a.mcap").read_bytes()
+    for room in (len(before) - 100, 3000):
+        found = run(tmp_path, "recorder", "a.mcap", before=LIMIT.format(room))
+        assert (found.returncode, found.stderr.count("\n")) == (1, 1)
+        assert "cannot write: File too large" in found.stderr
+    assert {path: path.read_bytes() for path in tmp_path.iterdir()} == {tmp_path / "a.mcap": before}
+
+
+def test_logs_of_others_and_inputs_are_never_replaced(tmp_path: Path, noisy_session: Session) -> None:
+    content = noisy_session.path.read_bytes()
+    own, bag = tmp_path / "own.mcap", tmp_path / "bag.mcap"
+    own.write_bytes(content)
+    bag.write_bytes(content.replace(b"\x04\0\0\0prim", b"\x04\0\0\0else", 1))
+    os.link(own, tmp_path / "hard.json")
+    (tmp_path / "world.json").write_text('{"size": [2, 2], "primitives": [], "walls": []}')
+    before = {path: path.read_bytes() for path in tmp_path.iterdir()}
+    replay = ["replay", own, "--no-detect"]
+    for arguments, error in (
+        (["recorder", bag], "--force to replace it"),
+        (["recorder", "world.json", "--world", "world.json", "--force"], "is the input world.json"),
+        ([*replay, "--save", bag], "--force to replace it"),
+        ([*replay, "--save", "world.json"], "--force to replace it"),
+        ([*replay, "--no-viewer", "--report", "hard.json", "--force"], "is the input"),
+        ([*replay, "--no-viewer", "--report", own, "--force"], "is the input"),
+        ([*replay, "--no-viewer", "--trajectory", "world.json"], "--force to replace it"),
+    ):
+        found = run(tmp_path, *arguments)
+        assert (found.returncode, found.stderr.count("\n")) == (2, 1), found.stderr
+        assert error in found.stderr
+    assert {path: path.read_bytes() for path in tmp_path.iterdir()} == before
+    again = run(tmp_path, *replay, "--no-viewer", "--trajectory", "world.json", "--force")
+    assert (again.returncode, again.stdout.splitlines()[-1]) == (0, "replaced: world.json")
+
+
+def test_earlier_results_are_replaced_and_a_line_says_so(tmp_path: Path, noisy_session: Session) -> None:
+    options = [noisy_session.path, "--no-detect", "--map", "m", "--trajectory", "t.tum"]
+    assert "replaced" not in run(tmp_path, "replay", *options).stdout
+    line = "replaced: noisy.prob.rrd, noisy.prob.report.json, m.pgm, m.yaml, t.tum"
+    assert run(tmp_path, "replay", *options).stdout.splitlines()[-2:] == [line, "open:  rerun noisy.prob.rrd"]
+
+
+def free_of_files(home: Path) -> dict[str, str]:
+    return os.environ | {"HOME": str(home), "XDG_CACHE_HOME": "", "XDG_CONFIG_HOME": "", "XDG_DATA_HOME": ""}
+
+
+NO_NETWORK = """\
+import ctypes, struct
+class Filter(ctypes.Structure): _fields_ = [("length", ctypes.c_ushort), ("code", ctypes.c_char_p)]
+steps = [(0x20, 0, 0, 0), (0x15, 0, 4, 41), (0x20, 0, 0, 16), (0x15, 1, 0, 2), (0x15, 0, 1, 10),
+         (0x06, 0, 0, 0x80000000), (0x06, 0, 0, 0x7FFF0000)]
+code = b"".join(struct.pack("HBBI", *step) for step in steps)
+libc = ctypes.CDLL(None, use_errno=True)
+assert libc.prctl(38, 1, 0, 0, 0) == 0 and libc.prctl(22, 2, ctypes.byref(Filter(len(steps), code))) == 0
+"""
+"""Let Linux on x86-64 kill the process (SIGSYS) when it asks for a socket of the internet."""
+
+
+@pytest.fixture
+def without_network(tmp_path: Path) -> Callable[..., subprocess.CompletedProcess[str]]:
+    """Return a function that runs a command which may not ask for an internet socket, in an empty home."""
+    attempt = [sys.executable, "-c", f"{NO_NETWORK}import socket; socket.socket()"]
+    if os.uname().machine != "x86_64" or subprocess.run(attempt, check=False).returncode != -signal.SIGSYS:
+        pytest.skip("system calls cannot be filtered here")
+    home = tmp_path / "home"
+    home.mkdir()
+
+    def run_it(folder: Path, part: str, *arguments: object) -> subprocess.CompletedProcess[str]:
+        found = run(folder, part, *arguments, before=NO_NETWORK, env=free_of_files(home))
+        assert list(home.rglob("*")) == []
+        return found
+
+    return run_it
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="system calls are filtered as Linux does it")
+def test_no_command_asks_for_the_network_or_writes_elsewhere(
+    tmp_path: Path, without_network: Callable[..., subprocess.CompletedProcess[str]]
+) -> None:
+    work = tmp_path / "work"
+    work.mkdir()
+    assert without_network(work, "recorder", "a.mcap", "--stops", "4", "4").returncode == 0
+    found = without_network(work, "replay", "a.mcap", "--mapper", "det,prob,forward")
+    assert found.returncode == 0, found.stderr
+    names = {"a.mcap", "a.det-prob-forward.rrd", *(f"a.{name}.report.json" for name in ("det", "prob", "forward"))}
+    assert {path.name for path in work.iterdir()} == names
+    for part in ("recorder", "replay", "detect"):
+        assert without_network(work, part, "--help").returncode == 0
+    assert socket.AF_INET == 2
+
+
+def test_a_pipe_is_no_log(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "pipe")
+    for name in ("pipe", "/dev/stdin"):
+        found = run(tmp_path, "replay", name, "--no-viewer", input="")
+        assert (found.returncode, found.stderr.count("\n")) == (1, 1)
+        assert "cannot be read back and forth" in found.stderr
+
+
+def test_odd_surroundings_are_no_bugs(tmp_path: Path, noisy_session: Session) -> None:
+    """Names that are no UTF-8, stdout that is ASCII, closed or full, a working folder that is gone."""
+    log = tmp_path / "gr\udcfc\u00df\x1b[2J.mcap"
+    log.write_bytes(noisy_session.path.read_bytes())
+    options = [log.name, "--no-detect", "--map", "m\udcfc", "--trajectory", "t\udcfc.tum"]
+    for before in ("", "sys.stdout = None; import os; os.close(1)\n", "sys.stdout = open('/dev/full', 'w')\n"):
+        found = run(tmp_path, "replay", *options, before=before, env=os.environ | {"PYTHONIOENCODING": "ascii"})
+        assert found.returncode == (1 if "full" in before else 0), found.stderr
+        assert "bug" not in found.stderr
+        assert "\x1b" not in found.stdout + found.stderr
+        assert len([path for path in tmp_path.iterdir() if path.suffix != ".mcap"]) == 5
+    gone = tmp_path / "gone"
+    gone.mkdir()
+    found = run(gone, "replay", log, before="import os; os.rmdir(os.getcwd())\n")
+    assert found.returncode == 2
+    assert found.stderr == ("prim-replay: error: the working folder does not exist any more: change to another one\n")
