@@ -68,6 +68,8 @@ def _run(app: typer.Typer, name: str, arguments: Sequence[str], interrupts: Inte
         return _print_line(name, f"{what} (try: {name} --help)", USAGE)
     except PrimError as error:
         return print_error(name, error, debug)
+    except typer.Abort:  # what older versions of typer make of it
+        return _print_line(name, "interrupted", interrupts.exit_code or INTERRUPTED)
     except BrokenPipeError:
         raise
     except Exception as error:
