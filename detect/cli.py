@@ -122,7 +122,7 @@ def dataset(
     with console.progress_bar("sessions", quiet) as progress:
         made = make_dataset(folder, options, progress, workers)
     if not quiet:
-        typer.echo(
+        console.echo(
             f"made {made} of {sum(options.sizes)} sessions in {folder} ({sum(options.sizes) - made} were there)"
         )
     return 0
@@ -149,7 +149,7 @@ def drawings(
     with console.progress_bar("drawings", quiet) as progress:
         made = make_drawings(folder, DrawingOptions(images, seed), progress)
     if not quiet:
-        typer.echo(f"made {made} of {sum(images)} drawings in {folder} ({sum(images) - made} were there)")
+        console.echo(f"made {made} of {sum(images)} drawings in {folder} ({sum(images) - made} were there)")
     return 0
 
 
@@ -191,7 +191,7 @@ def cnn(
 
         def report_epoch(done: int, total: int, loss: float, validation: float, name: str = name) -> None:
             if not quiet:
-                typer.echo(f"{name}: epoch {done} of {total}, loss {loss:.5f}, validation {validation:.5f}")
+                console.echo(f"{name}: epoch {done} of {total}, loss {loss:.5f}, validation {validation:.5f}")
 
         path = output / checkpoint_name(mapper.value, kinds)
         train_cnn(data, mapper.value, kinds, path, options, report_epoch)
@@ -225,7 +225,7 @@ def yolo(
     if epochs is not None:
         options = dataclasses.replace(options, epochs=epochs)
     best = train_yolo(data, mapper.value, output, options)
-    typer.echo(f"wrote: {best}")
+    console.echo(f"wrote: {best}")
     return 0
 
 
@@ -270,7 +270,7 @@ def export(
             raise UsageError("YOLO's thresholds are chosen on the set it was trained on: name it with --set")
         export_yolo(weights, mapper.value, output, trust, image_style(data, mapper.value))
         store_thresholds(output, data)
-    typer.echo(f"wrote: {output}")
+    console.echo(f"wrote: {output}")
     return 0
 
 
@@ -278,6 +278,9 @@ def export(
 def train_everything(
     work: Annotated[Path, typer.Argument(metavar="FOLDER", help="The folder of sets, training runs and weights.")],
     mapper: Annotated[list[MapperName] | None, typer.Option(help="A mapper; may be repeated. [default: all]")] = None,
+    trust: Annotated[
+        bool, typer.Option("--trust", help="Continue with the .pt in FOLDER, pickles that can run code.")
+    ] = False,
     debug: Annotated[bool, typer.Option("--debug", help="Show tracebacks.")] = False,
 ) -> int:
     """Train weights like those that come with prim.
@@ -286,10 +289,11 @@ def train_everything(
     interrupted run is continued.
     """
     require_training_extra()
-    from detect.training.recipe import train_all
+    from detect.training.recipe import check_trusted, train_all
 
-    for folder in train_all(work, [name.value for name in mapper or list(MapperName)], typer.echo):
-        typer.echo(f"made: {folder}")
+    check_trusted(work, trust)
+    for folder in train_all(work, [name.value for name in mapper or list(MapperName)], console.echo):
+        console.echo(f"made: {folder}")
     return 0
 
 
@@ -328,6 +332,9 @@ def _evaluate(
         int | None,
         typer.Option(metavar="N", help="Of --suite shipped: worker processes. [default: one per core]", min=1),
     ] = None,
+    trust: Annotated[
+        bool, typer.Option("--trust", help="Of --suite paper: continue with the .pt in FOLDER, which can run code.")
+    ] = False,
     output: Annotated[
         Path | None, typer.Option(metavar="FOLDER", help="The report's folder. [default: report, in FOLDER]")
     ] = None,
@@ -347,7 +354,7 @@ def _evaluate(
 
     def announce(text: str) -> None:
         if not quiet:
-            typer.echo(text)
+            console.echo(text)
 
     folder = output or work / "report"
     if suite is SuiteName.PAPER:
@@ -357,7 +364,10 @@ def _evaluate(
         require_training_extra()
         from detect.evaluation.suites import PaperSuite
         from detect.evaluation.tables import write_paper_report
+        from detect.training.recipe import check_trusted
 
+        if not so_far:
+            check_trusted(work, trust)
         paper = PaperSuite(work, announce)
         written = write_paper_report(paper.results() if so_far else paper.run(), folder)
     else:

@@ -13,6 +13,7 @@ Noise n has two readings, a share of 5 m as written and of 1 m as the paper's ma
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -29,7 +30,8 @@ from detect.training.dataset import DATASET_PRESETS, DatasetOptions, load_sample
 from detect.training.recipe import Announce, announce_duration, ensure_dataset, pretrain_yolo, train_weights
 from mapping.mapper import MAPPERS
 from prim import strict_json
-from prim.errors import OutputError, UsageError
+from prim.errors import UsageError
+from prim.files import ResultFormat, write_file
 from prim.shapes import Kind
 
 READINGS = {"as the maps suggest": 1.0, "as written": 5.0}
@@ -344,6 +346,10 @@ def read_result(path: Path) -> Json | None:
     return value
 
 
+RESULT = ResultFormat("a result of prim-eval", re.compile(b""))
+"""Whatever lies in the folders of an evaluation is its own."""
+
+
 def write_text(path: Path, text: str) -> None:
     """Write a text file atomically.
 
@@ -354,9 +360,4 @@ def write_text(path: Path, text: str) -> None:
     Raises:
         OutputError: It cannot be written.
     """
-    part = path.with_name(path.name + ".part")
-    try:
-        part.write_text(text, encoding="utf-8")
-        part.replace(path)
-    except OSError as error:
-        raise OutputError(path, error) from error
+    write_file(path, text.encode(), RESULT)

@@ -7,7 +7,6 @@ network's outputs unchanged.
 
 from __future__ import annotations
 
-import os
 import shutil
 import tempfile
 from collections.abc import Mapping
@@ -21,6 +20,7 @@ from detect.networks.parameters import PRESETS
 from detect.networks.tiles import TILE_SIZE
 from detect.networks.weights import CARD_KEY, ModelCard
 from detect.training.model import ParameterNetwork
+from detect.training.offline import keep_ultralytics_offline
 from prim.errors import UsageError
 from prim.shapes import Kind
 
@@ -113,7 +113,7 @@ def export_yolo(
         raise UsageError(f"{weights} is a pickle, which can run code: add --trust if you know where it is from")
     if not weights.is_file():
         raise UsageError(f"{weights} is not there")
-    os.environ["YOLO_AUTOINSTALL"] = "false"
+    keep_ultralytics_offline()
     from ultralytics import YOLO
 
     with tempfile.TemporaryDirectory() as folder:
@@ -141,6 +141,7 @@ def import_yolo(path: Path, images: torch.Tensor, output: Path) -> Path:
     Raises:
         UsageError: The file is no such network.
     """
+    keep_ultralytics_offline()
     from ultralytics.nn.tasks import DetectionModel
 
     folded = _read_arrays(path)

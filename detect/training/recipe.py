@@ -18,6 +18,7 @@ from detect.networks.yolo import Yolo
 from detect.training.dataset import DATASET_PRESETS, DatasetOptions, image_style, load_samples, make_dataset
 from detect.training.drawings import DRAWINGS, DrawingOptions, make_drawings
 from detect.training.thresholds import choose_thresholds
+from prim.errors import UsageError
 from prim.shapes import Kind
 
 MIXED, LARGE = DATASET_PRESETS["mixed"], DATASET_PRESETS["large"]
@@ -52,6 +53,23 @@ def announce_duration(step: str, announce: Announce) -> Iterator[None]:
         announce(f"{step}: {duration / 60:.1f} min")
 
 
+def check_trusted(work: Path, trust: bool) -> None:
+    """Check that a folder may be trained in: weights of YOLO that it holds from before would be loaded.
+
+    Args:
+        work: The folder.
+        trust: Whether it is trusted.
+
+    Raises:
+        UsageError: It is not, and holds such weights.
+    """
+    found = next(work.glob("**/weights/*.pt"), None)
+    if found is not None and not trust:
+        raise UsageError(
+            f"{found} is a pickle, which can run code: add --trust to continue in {work} if you know where it is from"
+        )
+
+
 def pretrain_yolo(work: Path, announce: Announce) -> Path:
     """Train YOLO on drawings, in place of COCO's weights.
 
@@ -67,7 +85,8 @@ def pretrain_yolo(work: Path, announce: Announce) -> Path:
     with announce_duration("drawings", announce):
         make_drawings(work / DRAWINGS, DrawingOptions())
     with announce_duration("YOLO on drawings", announce):
-        return train_yolo(work / DRAWINGS, DRAWINGS, work / "start", YOLO_PRESETS[DRAWINGS])
+        options = replace(YOLO_PRESETS[DRAWINGS], trust=True)
+        return train_yolo(work / DRAWINGS, DRAWINGS, work / "start", options)
 
 
 def ensure_dataset(folder: Path, options: DatasetOptions, announce: Announce) -> Path:

@@ -6,6 +6,7 @@ Needs the extra ``[train]`` (torch, ultralytics); a replay does not import this.
 from __future__ import annotations
 
 import os
+import re
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
@@ -21,8 +22,10 @@ from detect.training.crops import CropSamples, collect_crops
 from detect.training.dataset import image_style, load_samples, read_image
 from detect.training.export import import_cnn, import_yolo
 from detect.training.model import ParameterNetwork
+from detect.training.offline import keep_ultralytics_offline
 from prim import strict_json
 from prim.errors import UsageError
+from prim.files import OutputFile, ResultFormat
 from prim.shapes import Kind, Primitive
 
 HUBER_DELTA = 0.1
@@ -33,6 +36,9 @@ LENGTH_WEIGHT = 10.0
 
 FINISHED_MARKER = "finished"
 """Name of the file that marks a finished run of YOLO's training."""
+
+CHECKPOINT = ResultFormat("a checkpoint of prim-train", re.compile(rb"PK"))
+"""torch writes archives; another training's checkpoint was refused before this one began."""
 
 TrainingProgress = Callable[[int, int, float, float], None]
 """Called after each epoch with the epochs done, all epochs, and the loss on the training and the validation split."""
@@ -267,15 +273,15 @@ def _save_checkpoint(
     output: Path, settings: dict[str, Any], network: Any, optimizer: Any, schedule: Any, epochs: int
 ) -> None:
     """Write a checkpoint atomically."""
-    part = output.with_suffix(".part")
     state = settings | {
         "epochs": epochs,
         "network": network.state_dict(),
         "optimizer": optimizer.state_dict(),
         "schedule": schedule.state_dict(),
     }
-    torch.save(state, part)
-    part.replace(output)
+    file = OutputFile(output, CHECKPOINT)
+    torch.save(state, file.part)
+    file.commit()
 
 
 def _resume(output: Path, settings: dict[str, Any], network: Any, optimizer: Any, schedule: Any) -> int:
@@ -298,7 +304,8 @@ class YoloOptions:
     Attributes:
         model: Architecture, a yaml of ultralytics.
         start: Weights or exported network that training starts from; None: at random.
-        trust: Whether ``start`` may be a pickle, which can run code.
+        trust: Whether ``start`` and the checkpoint of an interrupted run may be loaded, which are pickles and can run
+            code.
         epochs: Passes over the data set.
         batch: Images of one step.
         image_size: Side of the images (pixels).
@@ -357,26 +364,31 @@ def train_yolo(data: Path, mapper: str, output: Path, options: YoloOptions) -> P
         The best weights, in ``output``.
 
     Raises:
-        UsageError: The data set is missing, or ``output`` holds a run with other data or options.
+        UsageError: The data set is missing, ``output`` holds a run with other data or options, or one that was
+            interrupted and is not trusted.
     """
     config = data / f"{mapper}.yaml"
     if not config.exists():
         raise UsageError(f"{data} holds no set for {mapper}: make one with prim-train dataset")
-    os.environ["YOLO_AUTOINSTALL"] = "false"
-    from ultralytics import YOLO, settings
-
-    settings.update({"sync": False})
+    keep_ultralytics_offline()
     _claim_folder(output, {"mapper": mapper, "set": _manifest(data), "options": _plain(asdict(options))})
     best, last = (output / "weights" / name for name in ("best.pt", "last.pt"))
+    if (output / FINISHED_MARKER).exists():
+        return best
+    if last.exists() and not options.trust:
+        raise UsageError(
+            f"{last} is a pickle, which can run code: add --trust to continue this run if you know where it is from"
+        )
+    from ultralytics import YOLO
+
     if options.start is not None and options.start.suffix == ".onnx":
         options = replace(options, start=_imported(options.start, data, mapper, output / "start.pt"), trust=True)
-    if not (output / FINISHED_MARKER).exists():
-        with bfloat16_autocast():
-            if not last.exists():
-                _start_training(YOLO(options.model), config, output, options)
-            elif not _is_stripped(last):
-                YOLO(str(last)).train(resume=True, trainer=_trainer())
-        (output / FINISHED_MARKER).touch()
+    with bfloat16_autocast():
+        if not last.exists():
+            _start_training(YOLO(options.model), config, output, options)
+        elif not _is_stripped(last):
+            YOLO(str(last)).train(resume=True, trainer=_trainer())
+    (output / FINISHED_MARKER).touch()
     return best
 
 
@@ -392,9 +404,13 @@ def _imported(start: Path, data: Path, mapper: str, output: Path) -> Path:
 def _claim_folder(output: Path, settings: dict[str, Any]) -> None:
     """Write a run's settings into its folder; raise UsageError where it holds a run with others."""
     path = output / "asked.json"
+    del settings["options"]["trust"]
     text = strict_json.dumps(settings, indent=1) + "\n"
-    if path.exists() and path.read_text(encoding="utf-8") != text:
-        raise UsageError(f"{output} was trained on another set or with other options: give another folder")
+    if path.exists():
+        earlier = strict_json.loads(path.read_text(encoding="utf-8"))
+        earlier["options"].pop("trust", None)
+        if earlier != strict_json.loads(text):
+            raise UsageError(f"{output} was trained on another set or with other options: give another folder")
     output.mkdir(parents=True, exist_ok=True)
     path.write_text(text, encoding="utf-8")
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import pickle
 from collections.abc import Callable
 from pathlib import Path
 
@@ -90,6 +91,24 @@ def test_weights_that_can_run_code_must_be_trusted(run: Run) -> None:
     pytest.importorskip("torch", reason="needs the extra [train]")
     code, _, err = run("yolo", "set", "out", "--start", "a.pt")
     assert code == 2 and "--trust" in err
+
+
+class RunsCode:
+    def __reduce__(self) -> tuple[object, tuple[str]]:
+        return exec, ("open('ran', 'w').close()",)
+
+
+@pytest.mark.parametrize("command", ["yolo", "all"])
+def test_an_interrupted_run_must_be_trusted_to_go_on(run: Run, command: str) -> None:
+    """Its checkpoint is a pickle: nothing in it may run."""
+    pytest.importorskip("torch", reason="needs the extra [train]")
+    run("dataset", "set", "--maps", 1, 1, "--mapper", "det")
+    last = Path("out") / "weights" / "last.pt"
+    last.parent.mkdir(parents=True)
+    last.write_bytes(pickle.dumps(RunsCode()))
+    code, _, err = run("yolo", "set", "out", "--mapper", "det") if command == "yolo" else run("all", "out")
+    assert code == 2 and "last.pt is a pickle" in err and "--trust" in err and err.count("\n") == 1
+    assert not Path("ran").exists()
 
 
 def test_exported_weights_need_no_trust(run: Run) -> None:
