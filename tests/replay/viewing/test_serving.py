@@ -1,0 +1,61 @@
+"""Where a served replay listens, and that it ends with the command."""
+
+import signal
+import subprocess
+import sys
+import time
+import urllib.request
+from pathlib import Path
+
+import pytest
+
+from prim.errors import UsageError
+from recorder.session import Session
+from replay.viewing.checks import find_free_ports, local_address
+from replay.viewing.protocol import ViewerOptions
+
+ROOT = Path(__file__).parents[3]
+
+
+def test_only_addresses_of_this_machine_are_served() -> None:
+    assert local_address("127.0.0.2") == "127.0.0.2"
+    for host in ("198.51.100.7", "", "no such host"):
+        with pytest.raises(UsageError, match="--serve-host"):
+            local_address(host)
+    with pytest.raises(UsageError, match="--serve-host goes with --serve"):
+        ViewerOptions(serve_host="127.0.0.1")
+
+
+def listening(port: int) -> set[str]:
+    """The IPv4 addresses (as the kernel lists them) and v6 markers on which something listens at a port."""
+    found = set()
+    for table in ("tcp", "tcp6"):
+        for line in Path(f"/proc/net/{table}").read_text().splitlines()[1:]:
+            address, state = line.split()[1], line.split()[3]
+            if state == "0A" and int(address.split(":")[1], 16) == port:
+                found.add(address.split(":")[0])
+    return found
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="reads the kernel's table of sockets")
+def test_a_replay_is_served_on_loopback_until_it_is_interrupted(tmp_path: Path, noisy_session: Session) -> None:
+    code = f"import sys; sys.path.insert(0, {str(ROOT)!r}); from replay.__main__ import main; main()"
+    ports = find_free_ports((9876, 9090), "127.0.0.1")
+    command = [sys.executable, "-c", code, str(noisy_session.path), "--serve", "--no-detect"]
+    process = subprocess.Popen(command, cwd=tmp_path, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True)
+    assert process.stderr is not None
+    lines: list[str] = []
+    while not any("still served" in line for line in lines) and (line := process.stderr.readline()):
+        lines.append(line)
+    assert f"browse: http://127.0.0.1:{ports[1]}/" in lines[0], lines
+    assert [listening(port) for port in ports] == [{"0100007F"}] * 2
+    with urllib.request.urlopen(f"http://127.0.0.1:{ports[1]}/", timeout=10) as page:
+        assert b"rerun" in page.read().lower()
+    process.send_signal(signal.SIGINT)
+    process.communicate(timeout=20)
+    assert process.returncode == 0
+    for _ in range(100):
+        if not any(listening(port) for port in ports):
+            break
+        time.sleep(0.1)
+    assert [listening(port) for port in ports] == [set()] * 2
