@@ -414,9 +414,9 @@ def parse_kinds(names: Sequence[str]) -> list[Kind]:
 
 def main() -> None:
     """Run prim-train."""
-    sys.exit(console.run(train, "prim-train", sys.argv[1:]))
+    console.exit_process(console.run(train, "prim-train", sys.argv[1:]))
 
 
 def main_eval() -> None:
     """Run prim-eval."""
-    sys.exit(console.run(evaluation, "prim-eval", sys.argv[1:]))
+    console.exit_process(console.run(evaluation, "prim-eval", sys.argv[1:]))

@@ -10,7 +10,7 @@ import traceback
 import warnings
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
-from typing import TextIO
+from typing import NoReturn, TextIO
 
 import typer
 
@@ -21,6 +21,8 @@ from prim.text import printable
 USAGE = 2
 FAILED = 1
 INTERRUPTED = 130
+SIGNALLED = 128
+"""Exit codes above this one: 128 and the number of the signal that ended the command."""
 
 
 def run(app: typer.Typer, name: str, arguments: Sequence[str]) -> int:
@@ -38,7 +40,7 @@ def run(app: typer.Typer, name: str, arguments: Sequence[str]) -> int:
     debug = "--debug" in arguments
     gc.set_threshold(100_000, 50, 50)  # imports make many objects that stay: collecting among them takes 0.4 s
     _prepare_streams()
-    with warnings.catch_warnings(), Interrupts() as interrupts:
+    with warnings.catch_warnings(), _without_ignored_interruptions(), Interrupts() as interrupts:
         if not sys.warnoptions:
             warnings.simplefilter("ignore")  # numpy's quote lines of source code; what matters is a note or an error
         try:
@@ -76,6 +78,33 @@ def _run(app: typer.Typer, name: str, arguments: Sequence[str], interrupts: Inte
         if debug:
             _print_traceback(error)
         return _print_line(name, _describe(error), FAILED)
+
+
+@contextmanager
+def _without_ignored_interruptions() -> Iterator[None]:
+    """Print nothing of an interruption that came where Python is called from C and drops it: it is raised again."""
+    before = sys.unraisablehook
+    sys.unraisablehook = lambda found: None if isinstance(found.exc_value, KeyboardInterrupt) else before(found)
+    try:
+        yield
+    finally:
+        sys.unraisablehook = before
+
+
+def exit_process(code: int) -> NoReturn:
+    """End the process with an exit code; at once where it was interrupted.
+
+    An interruption may have come while a library held one of its locks, for which its clean-up would wait for ever.
+
+    Args:
+        code: The exit code that :func:`run` returned.
+    """
+    if code > SIGNALLED:
+        for stream in (sys.stdout, sys.stderr):
+            with suppress(OSError, ValueError):
+                stream.flush()
+        os._exit(code)
+    sys.exit(code)
 
 
 def _describe(error: Exception) -> str:

@@ -74,8 +74,12 @@ class Interrupts:
             self._pending = True
             os.write(2, HELD_BACK)  # a signal can come while something is printed: print() may not be called again
             return
-        self._pending = False
+        self._pending = True  # until it is handled: what calls Python from C drops exceptions
         raise Interruption(number)
+
+    def handled(self) -> None:
+        """Forget the last interruption: what it asked for is done."""
+        self._pending = False
 
     @contextmanager
     def held(self) -> Iterator[None]:
@@ -101,7 +105,6 @@ class Interrupts:
 
     def _raise_pending(self) -> None:
         if self._pending and not self._is_held:
-            self._pending = False
             raise Interruption((self.exit_code or 128 + signal.SIGINT) - 128)
 
     def released_while_iterating(self, items: Iterable[Item]) -> Iterator[Item]:

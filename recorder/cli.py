@@ -170,4 +170,4 @@ def _summary(session: Session, options: SessionOptions) -> str:
 
 def main() -> None:
     """Run prim-record: the entry point."""
-    sys.exit(console.run(app, "prim-record", sys.argv[1:]))
+    console.exit_process(console.run(app, "prim-record", sys.argv[1:]))

@@ -549,4 +549,4 @@ def _is_number(text: str) -> bool:
 
 def main() -> None:
     """The entry point."""
-    sys.exit(console.run(app, "prim-replay", join_bounds(sys.argv[1:])))
+    console.exit_process(console.run(app, "prim-replay", join_bounds(sys.argv[1:])))

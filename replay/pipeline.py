@@ -150,6 +150,7 @@ class Pipeline:
             if not self._interrupts.active or not all(branch.usage.scans for branch in branches):
                 raise
             self._interrupted = interruption
+            self._interrupts.handled()
             with self._interrupts.held():
                 for branch in branches:
                     branch.finish_map()
