@@ -77,6 +77,8 @@ def _run(app: typer.Typer, name: str, arguments: Sequence[str], interrupts: Inte
     except Exception as error:
         if debug:
             _print_traceback(error)
+        if interrupts.exit_code is not None:  # which an extension that was being loaded makes an ImportError of
+            return _print_line(name, "interrupted", interrupts.exit_code)
         return _print_line(name, _describe(error), FAILED)
 
 
