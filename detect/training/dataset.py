@@ -16,6 +16,7 @@ interrupted run can be continued. In ``detect`` only training and evaluation use
 from __future__ import annotations
 
 import os
+import re
 import tempfile
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
@@ -34,6 +35,7 @@ from mapping.grid import GridFrame, OccupancyGrid
 from mapping.mapper import MAPPERS, make_mapper
 from prim import strict_json
 from prim.errors import OutputError, UsageError
+from prim.files import ResultFormat, write_file
 from prim.log import open_log
 from prim.log.messages import POSE_TYPE, SCAN_TOPIC, TRUE_POSE_TOPIC, decode_poses, decode_scan, planar_pose
 from prim.scan import Scan
@@ -52,6 +54,9 @@ MIN_INSIDE_SHARE = 0.6
 """A primitive belongs to a tile that holds at least this share of its outline; set by hand."""
 
 SPLITS = ("train", "val")
+
+OF_THE_SET = ResultFormat("a file of prim-train dataset", re.compile(b""))
+"""What lies in the folder of a data set is its own: its manifest is checked first."""
 
 Progress = Callable[[int, int], None]
 """Called with what is done and what there is in all."""
@@ -377,16 +382,28 @@ def write_image(path: Path, image: NDArray[np.uint8]) -> None:
     part.replace(path)
 
 
+def data_description(folder: Path, mapper: str) -> str:
+    """Return the data description that ultralytics trains from.
+
+    Args:
+        folder: Folder of the data set.
+        mapper: Name of the mapper, or of what made the images.
+
+    Returns:
+        The text of a YAML file.
+    """
+    names = "".join(f"  {k}: {kind.value}\n" for k, kind in enumerate(KINDS))
+    return f"path: {folder.resolve()}\ntrain: images/{mapper}/train\nval: images/{mapper}/val\nnames:\n{names}"
+
+
 def write_data_yaml(folder: Path, mapper: str) -> None:
-    """Write the data description that ultralytics trains from.
+    """Write the data description, which marks a complete set.
 
     Args:
         folder: Folder of the data set.
         mapper: Name of the mapper, or of what made the images.
     """
-    names = "".join(f"  {k}: {kind.value}\n" for k, kind in enumerate(KINDS))
-    text = f"path: {folder.resolve()}\ntrain: images/{mapper}/train\nval: images/{mapper}/val\nnames:\n{names}"
-    (folder / f"{mapper}.yaml").write_text(text, encoding="utf-8")
+    write_file(folder / f"{mapper}.yaml", data_description(folder, mapper).encode(), OF_THE_SET)
 
 
 @dataclass(frozen=True)

@@ -20,7 +20,7 @@ from detect.networks.parameters import PRESETS
 from detect.networks.tiles import TILE_SIZE
 from detect.networks.weights import CARD_KEY, ModelCard
 from detect.training.model import ParameterNetwork
-from detect.training.offline import keep_ultralytics_offline
+from detect.training.offline import load_ultralytics
 from prim.errors import UsageError
 from prim.shapes import Kind
 
@@ -113,13 +113,13 @@ def export_yolo(
         raise UsageError(f"{weights} is a pickle, which can run code: add --trust if you know where it is from")
     if not weights.is_file():
         raise UsageError(f"{weights} is not there")
-    keep_ultralytics_offline()
-    from ultralytics import YOLO
-
+    ultralytics = load_ultralytics()
     with tempfile.TemporaryDirectory() as folder:
         copy = Path(folder) / weights.name
         shutil.copy(weights, copy)
-        made = YOLO(str(copy)).export(format="onnx", imgsz=TILE_SIZE, dynamic=True, opset=OPSET, verbose=False)
+        made = ultralytics.YOLO(str(copy)).export(
+            format="onnx", imgsz=TILE_SIZE, dynamic=True, opset=OPSET, verbose=False
+        )
         shutil.move(made, output)
     store_half_precision(output)
     card = ModelCard("yolo", mapper, style=style, about=dict(about or {}))
@@ -141,7 +141,7 @@ def import_yolo(path: Path, images: torch.Tensor, output: Path) -> Path:
     Raises:
         UsageError: The file is no such network.
     """
-    keep_ultralytics_offline()
+    load_ultralytics()
     from ultralytics.nn.tasks import DetectionModel
 
     folded = _read_arrays(path)

@@ -6,17 +6,49 @@ import atexit
 import os
 import shutil
 import tempfile
+from functools import cache
+from typing import Any
+
+FOLDERS = ("YOLO_CONFIG_DIR", "MPLCONFIGDIR")
+"""Variables that name the folders in which ultralytics and matplotlib keep settings; by default, in the home."""
 
 
-def keep_ultralytics_offline() -> None:
-    """Set what ultralytics and matplotlib read when they are imported; call it before.
+@cache
+def load_ultralytics() -> Any:
+    """Import ultralytics; the only way to do so.
 
-    Their settings lie in a temporary folder until the process ends. Worker processes inherit all of it.
+    Its settings and matplotlib's lie in a temporary folder until the process ends; worker processes inherit that. It
+    opens no connection, reports to no tracker of experiments, and unpickles no list of labels of a data set.
+
+    Returns:
+        The package.
     """
-    if "YOLO_CONFIG_DIR" not in os.environ:
-        folder = tempfile.mkdtemp(prefix="prim-train-")
-        atexit.register(shutil.rmtree, folder, ignore_errors=True)
-        os.environ["YOLO_CONFIG_DIR"] = folder
-        os.environ.setdefault("MPLCONFIGDIR", folder)
+    _use_temporary_folders()
     os.environ["YOLO_AUTOINSTALL"] = "false"
     os.environ["YOLO_OFFLINE"] = "true"
+    import ultralytics
+    from ultralytics.data import dataset, utils
+
+    switches = {name: False for name, value in ultralytics.settings.items() if value is True}
+    dict.update(ultralytics.settings, switches)  # for this process: its own update would write them to a file
+    dataset.load_dataset_cache_file = _refuse_cache
+    utils.check_font = _find_no_font
+    return ultralytics
+
+
+def _use_temporary_folders() -> None:
+    """Name a folder that is removed at the end of the process where the user has named none."""
+    missing = [name for name in FOLDERS if name not in os.environ]
+    if missing:
+        folder = tempfile.mkdtemp(prefix="prim-train-")
+        atexit.register(shutil.rmtree, folder, ignore_errors=True)
+        os.environ.update(dict.fromkeys(missing, folder))
+
+
+def _refuse_cache(path: Any) -> Any:
+    """Take the place of the function that unpickles a data set's list of labels: they are read from their files."""
+    raise FileNotFoundError(path)
+
+
+def _find_no_font(name: str) -> None:
+    """Take the place of the function that downloads a font for plots, of which there are none."""

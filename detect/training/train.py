@@ -5,6 +5,7 @@ Needs the extra ``[train]`` (torch, ultralytics); a replay does not import this.
 
 from __future__ import annotations
 
+import io
 import os
 import re
 from collections.abc import Callable, Iterator, Sequence
@@ -19,13 +20,13 @@ import torch
 
 from detect.networks.parameters import PAPER, PRESETS, PRIM, encode_parameters
 from detect.training.crops import CropSamples, collect_crops
-from detect.training.dataset import image_style, load_samples, read_image
+from detect.training.dataset import data_description, image_style, load_samples, read_image
 from detect.training.export import import_cnn, import_yolo
 from detect.training.model import ParameterNetwork
-from detect.training.offline import keep_ultralytics_offline
+from detect.training.offline import load_ultralytics
 from prim import strict_json
 from prim.errors import UsageError
-from prim.files import OutputFile, ResultFormat
+from prim.files import ResultFormat, output_errors, write_file
 from prim.shapes import Kind, Primitive
 
 HUBER_DELTA = 0.1
@@ -39,6 +40,9 @@ FINISHED_MARKER = "finished"
 
 CHECKPOINT = ResultFormat("a checkpoint of prim-train", re.compile(rb"PK"))
 """torch writes archives; another training's checkpoint was refused before this one began."""
+
+OF_THE_RUN = ResultFormat("a file of prim-train", re.compile(b""))
+"""What lies in the folder of a run is its own: the folder is claimed first."""
 
 TrainingProgress = Callable[[int, int, float, float], None]
 """Called after each epoch with the epochs done, all epochs, and the loss on the training and the validation split."""
@@ -279,22 +283,28 @@ def _save_checkpoint(
         "optimizer": optimizer.state_dict(),
         "schedule": schedule.state_dict(),
     }
-    file = OutputFile(output, CHECKPOINT)
-    torch.save(state, file.part)
-    file.commit()
+    content = io.BytesIO()
+    torch.save(state, content)
+    write_file(output, content.getvalue(), CHECKPOINT)
 
 
 def _resume(output: Path, settings: dict[str, Any], network: Any, optimizer: Any, schedule: Any) -> int:
     """Load a checkpoint where there is one; return how many epochs were trained."""
     if not output.exists():
         return 0
-    state = torch.load(output, weights_only=True, map_location="cpu")
-    if {name: state.get(name) for name in settings} != settings:
-        raise UsageError(f"{output} was trained on another set or with other options: give another file")
-    network.load_state_dict(state["network"])
-    optimizer.load_state_dict(state["optimizer"])
-    schedule.load_state_dict(state["schedule"])
-    return int(state["epochs"])
+    try:
+        state = torch.load(output, weights_only=True, map_location="cpu")
+        same = {name: state.get(name) for name in settings} == settings
+        if same:
+            network.load_state_dict(state["network"])
+            optimizer.load_state_dict(state["optimizer"])
+            schedule.load_state_dict(state["schedule"])
+            return int(state["epochs"])
+    except Exception as error:  # torch raises exceptions of many types on foreign files
+        raise UsageError(
+            f"{output} is no checkpoint of prim-train cnn, or damaged: give another file"
+        ) from error
+    raise UsageError(f"{output} was trained on another set or with other options: give another file")
 
 
 @dataclass(frozen=True)
@@ -367,10 +377,8 @@ def train_yolo(data: Path, mapper: str, output: Path, options: YoloOptions) -> P
         UsageError: The data set is missing, ``output`` holds a run with other data or options, or one that was
             interrupted and is not trusted.
     """
-    config = data / f"{mapper}.yaml"
-    if not config.exists():
+    if not (data / f"{mapper}.yaml").exists():
         raise UsageError(f"{data} holds no set for {mapper}: make one with prim-train dataset")
-    keep_ultralytics_offline()
     _claim_folder(output, {"mapper": mapper, "set": _manifest(data), "options": _plain(asdict(options))})
     best, last = (output / "weights" / name for name in ("best.pt", "last.pt"))
     if (output / FINISHED_MARKER).exists():
@@ -379,23 +387,20 @@ def train_yolo(data: Path, mapper: str, output: Path, options: YoloOptions) -> P
         raise UsageError(
             f"{last} is a pickle, which can run code: add --trust to continue this run if you know where it is from"
         )
-    from ultralytics import YOLO
-
-    if options.start is not None and options.start.suffix == ".onnx":
-        options = replace(options, start=_imported(options.start, data, mapper, output / "start.pt"), trust=True)
     with bfloat16_autocast():
         if not last.exists():
-            _start_training(YOLO(options.model), config, output, options)
+            _start_training(data, mapper, output, options)
         elif not _is_stripped(last):
-            YOLO(str(last)).train(resume=True, trainer=_trainer())
+            load_ultralytics().YOLO(str(last)).train(resume=True, trainer=_trainer())
     (output / FINISHED_MARKER).touch()
     return best
 
 
 def _imported(start: Path, data: Path, mapper: str, output: Path) -> Path:
-    """Convert an exported network to weights to train, with statistics of normalisations from the data set."""
-    if output.exists():
-        return output
+    """Convert an exported network to weights to train, with statistics of normalisations from the data set.
+
+    What an interrupted run left in ``output`` is made again, since it would be unpickled.
+    """
     first_batch = [read_image(sample) for sample in load_samples(data, mapper, "train")[: YoloOptions.batch]]
     images = torch.from_numpy(np.stack(first_batch)).permute(0, 3, 1, 2).float() / 255
     return import_yolo(start, images, output)
@@ -407,16 +412,26 @@ def _claim_folder(output: Path, settings: dict[str, Any]) -> None:
     del settings["options"]["trust"]
     text = strict_json.dumps(settings, indent=1) + "\n"
     if path.exists():
-        earlier = strict_json.loads(path.read_text(encoding="utf-8"))
-        earlier["options"].pop("trust", None)
+        earlier = _read_json(path)
+        if isinstance(earlier, dict) and isinstance(earlier.get("options"), dict):
+            earlier["options"].pop("trust", None)
         if earlier != strict_json.loads(text):
             raise UsageError(f"{output} was trained on another set or with other options: give another folder")
-    output.mkdir(parents=True, exist_ok=True)
-    path.write_text(text, encoding="utf-8")
+    with output_errors(output):
+        output.mkdir(parents=True, exist_ok=True)
+    write_file(path, text.encode(), OF_THE_RUN)
 
 
 def _manifest(data: Path) -> Any:
-    return strict_json.loads((data / "manifest.json").read_text(encoding="utf-8"))
+    return _read_json(data / "manifest.json")
+
+
+def _read_json(path: Path) -> Any:
+    """Read a file of a data set or of a run; raise UsageError where it cannot be read."""
+    try:
+        return strict_json.loads(path.read_bytes())
+    except (OSError, ValueError) as error:
+        raise UsageError(f"{path} is damaged or cannot be read: give another folder") from error
 
 
 def _plain(options: dict[str, Any]) -> dict[str, Any]:
@@ -426,19 +441,30 @@ def _plain(options: dict[str, Any]) -> dict[str, Any]:
 
 
 def _is_stripped(checkpoint: Path) -> bool:
-    """Return whether a run ended and its checkpoint was stripped of the optimiser; our own file is loaded."""
-    return int(torch.load(checkpoint, weights_only=False, map_location="cpu")["epoch"]) < 0
+    """Return whether a run ended and its checkpoint was stripped of the optimiser; the file is trusted."""
+    load_ultralytics()  # whose classes the pickle holds
+    try:
+        return int(torch.load(checkpoint, weights_only=False, map_location="cpu")["epoch"]) < 0
+    except Exception as error:  # torch raises exceptions of many types on foreign files
+        raise UsageError(f"{checkpoint} is no checkpoint of prim-train yolo: give another folder") from error
 
 
-def _start_training(model: Any, config: Path, output: Path, options: YoloOptions) -> None:
-    """Start ultralytics' training."""
+def _start_training(data: Path, mapper: str, output: Path, options: YoloOptions) -> None:
+    """Start ultralytics' training.
+
+    It gets a data description of the run's own: that of a data set may hold a script, which ultralytics would run.
+    """
+    if options.start is not None and options.start.suffix == ".onnx":
+        options = replace(options, start=_imported(options.start, data, mapper, output / "start.pt"), trust=True)
+    description = output / "data.yaml"
+    write_file(description, data_description(data, mapper).encode(), OF_THE_RUN)
     turns = {"degrees": 180.0, "flipud": 0.5} if options.turn else {}
-    model.train(
+    load_ultralytics().YOLO(options.model).train(
         trainer=_trainer(),
         workers=max(2, len(os.sched_getaffinity(0)) - 1),
         cache="ram",
         amp=False,  # on a GPU, ultralytics checks it with weights that it downloads
-        data=str(config),
+        data=str(description),
         epochs=options.epochs,
         batch=options.batch,
         imgsz=options.image_size,
@@ -463,6 +489,7 @@ def _start_training(model: Any, config: Path, output: Path, options: YoloOptions
 
 def _trainer() -> type:
     """Return ultralytics' trainer with tensors in channels-last layout: convolutions on a CPU are faster so."""
+    load_ultralytics()
     from ultralytics.models.yolo.detect import DetectionTrainer
 
     threads = int(os.environ.get("OMP_NUM_THREADS", len(os.sched_getaffinity(0))))
