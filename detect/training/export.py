@@ -117,9 +117,8 @@ def export_yolo(
     with tempfile.TemporaryDirectory() as folder:
         copy = Path(folder) / weights.name
         shutil.copy(weights, copy)
-        made = ultralytics.YOLO(str(copy)).export(
-            format="onnx", imgsz=TILE_SIZE, dynamic=True, opset=OPSET, verbose=False
-        )
+        model = ultralytics.YOLO(str(copy))
+        made = model.export(format="onnx", imgsz=TILE_SIZE, dynamic=True, opset=OPSET, verbose=False)
         shutil.move(made, output)
     store_half_precision(output)
     card = ModelCard("yolo", mapper, style=style, about=dict(about or {}))

@@ -301,9 +301,7 @@ def _resume(output: Path, settings: dict[str, Any], network: Any, optimizer: Any
             schedule.load_state_dict(state["schedule"])
             return int(state["epochs"])
     except Exception as error:  # torch raises exceptions of many types on foreign files
-        raise UsageError(
-            f"{output} is no checkpoint of prim-train cnn, or damaged: give another file"
-        ) from error
+        raise UsageError(f"{output} is no checkpoint of prim-train cnn, or damaged: give another file") from error
     raise UsageError(f"{output} was trained on another set or with other options: give another file")
 
 
