@@ -255,21 +255,20 @@ def export(
     trust: Annotated[
         bool, typer.Option("--trust", help="Load YOLO's .pt, which is a pickle that can run code.")
     ] = False,
+    force: Annotated[bool, typer.Option("--force", help="Replace a file that is no network of prim-train.")] = False,
     debug: Annotated[bool, typer.Option("--debug", help="Show tracebacks.")] = False,
 ) -> int:
     """Export trained weights to ONNX, with a model card."""
     require_training_extra()
-    from detect.training.dataset import image_style
-    from detect.training.export import export_cnn, export_yolo
-    from detect.training.recipe import store_thresholds
+    from detect.training.export import export_cnn
+    from detect.training.recipe import export_detector
 
     if stage is StageName.CNN:
-        export_cnn(weights, mapper.value, output)
+        export_cnn(weights, mapper.value, output, force=force)
     else:
         if data is None:
             raise UsageError("YOLO's thresholds are chosen on the set it was trained on: name it with --set")
-        export_yolo(weights, mapper.value, output, trust, image_style(data, mapper.value))
-        store_thresholds(output, data)
+        export_detector(weights, mapper.value, data, output, trust, force=force)
     console.echo(f"wrote: {output}")
     return 0
 
@@ -338,6 +337,9 @@ def _evaluate(
     output: Annotated[
         Path | None, typer.Option(metavar="FOLDER", help="The report's folder. [default: report, in FOLDER]")
     ] = None,
+    force: Annotated[
+        bool, typer.Option("--force", help="Replace files in the report's folder that are no reports of prim-eval.")
+    ] = False,
     quiet: Annotated[bool, typer.Option("--quiet", help="Print errors only.")] = False,
     debug: Annotated[bool, typer.Option("--debug", help="Show tracebacks.")] = False,
     version: Annotated[
@@ -363,24 +365,27 @@ def _evaluate(
             raise UsageError(f"{name} goes with --suite shipped")
         require_training_extra()
         from detect.evaluation.suites import PaperSuite
-        from detect.evaluation.tables import write_paper_report
+        from detect.evaluation.tables import PAPER_REPORT, check_report, write_paper_report
         from detect.training.recipe import check_trusted
 
         if not so_far:
             check_trusted(work, trust)
+            check_report(folder, PAPER_REPORT, force)
         paper = PaperSuite(work, announce)
-        written = write_paper_report(paper.results() if so_far else paper.run(), folder)
+        written = write_paper_report(paper.results() if so_far else paper.run(), folder, force)
     else:
         from detect.evaluation.suites import ShippedSuite
-        from detect.evaluation.tables import write_shipped_report
+        from detect.evaluation.tables import SHIPPED_REPORT, check_report, write_shipped_report
         from detect.networks.weights import SHIPPED
 
+        if not so_far:
+            check_report(folder, SHIPPED_REPORT, force)
         shipped = ShippedSuite(work, weights or SHIPPED, announce)
         mappers, modes = (
             [name.value for name in names] for names in (mapper or MapperName, recorded or RecordingMode)
         )
         results = shipped.results() if so_far else shipped.run(sessions, mappers, modes, jobs)
-        written = write_shipped_report(results, folder)
+        written = write_shipped_report(results, folder, force)
     for path in written:
         announce(f"wrote: {path}")
     return 0

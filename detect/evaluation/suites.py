@@ -339,10 +339,13 @@ def evaluate_networks(path: Path, networks: Path, mapper: str, data: Callable[[]
 
 
 def read_result(path: Path) -> Json | None:
-    """Read a stored evaluation; None where there is none."""
+    """Read a stored evaluation; None where there is none; raise UsageError where it is damaged."""
     if not path.exists():
         return None
-    value: Json = strict_json.loads(path.read_text(encoding="utf-8"))
+    try:
+        value: Json = strict_json.loads(path.read_bytes())
+    except (OSError, ValueError) as error:
+        raise UsageError(f"{path} is damaged or cannot be read: remove it to have it evaluated again") from error
     return value
 
 

@@ -5,13 +5,27 @@ from __future__ import annotations
 import csv
 import io
 import math
-from collections.abc import Iterator, Sequence
+import re
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from detect.evaluation.paper import ROWS, SHAPES, TABLE_1, TABLE_2, TEST_IMAGES, PaperRow
-from detect.evaluation.suites import READINGS, Case, PaperResult, ShippedResult, cases, write_text
+from detect.evaluation.suites import READINGS, Case, PaperResult, ShippedResult, cases
+from detect.training.offline import use_temporary_folders
 from prim.choices import MapperName
+from prim.files import ResultFormat, check_output, output_errors, write_file
+
+PAPER_REPORT = {
+    "paper.md": ResultFormat("a report of prim-eval", re.compile(b"# The paper's tables, reproduced\n")),
+    "paper.csv": ResultFormat("a table of prim-eval", re.compile(b"reading,mapper,train_n,")),
+    "paper.png": ResultFormat("a plot of prim-eval", re.compile(rb"\x89PNG.{33}tEXtSoftware\0prim-eval", re.DOTALL)),
+}
+SHIPPED_REPORT = {
+    "shipped.md": ResultFormat("a report of prim-eval", re.compile(b"# Evaluation of the shipped weights\n")),
+    "shipped.csv": ResultFormat("a table of prim-eval", re.compile(b"recorded,noise_std_m,mapper,")),
+}
+"""Files of the reports, and what earlier ones are recognised by."""
 
 BOX_METRICS = {"f1": "F1", "map50": "mAP 0.5", "map50_95": "mAP 0.5–0.95", "auc": "AUC"}
 """Columns of Table I: the fields of BoxMetrics and their titles."""
@@ -56,25 +70,51 @@ The paper's abstract: 95 % of the shapes correctly classified at low noise, 85 %
 12 %."""
 
 
-def write_paper_report(results: Sequence[PaperResult], folder: Path) -> list[Path]:
+def check_report(folder: Path, report: Mapping[str, ResultFormat], force: bool = False) -> None:
+    """Make a report's folder where it is missing, and check that all of the report can be written there.
+
+    Args:
+        folder: The folder.
+        report: PAPER_REPORT or SHIPPED_REPORT.
+        force: Whether files may be replaced that are no earlier report.
+
+    Raises:
+        OutputError: A file cannot be written.
+        UsageError: There is another file in the place of one.
+    """
+    with output_errors(folder):
+        folder.mkdir(parents=True, exist_ok=True)
+    for name, result in report.items():
+        check_output(folder / name, result, force)
+
+
+def _write_report(
+    folder: Path, report: Mapping[str, ResultFormat], contents: Sequence[bytes], force: bool
+) -> list[Path]:
+    """Write the files of a report and return their paths."""
+    check_report(folder, report, force)
+    for (name, result), content in zip(report.items(), contents, strict=True):
+        write_file(folder / name, content, result, force)
+    return [folder / name for name in report]
+
+
+def write_paper_report(results: Sequence[PaperResult], folder: Path, force: bool = False) -> list[Path]:
     """Write paper.md, paper.csv and paper.png.
 
     Args:
         results: Results of the paper's suite.
         folder: Where they go.
+        force: Whether files may be replaced that are no earlier report.
 
     Returns:
         Their paths.
 
     Raises:
         OutputError: A file cannot be written.
+        UsageError: There is another file in the place of one.
     """
-    markdown, table, plot = (folder / f"paper.{ending}" for ending in ("md", "csv", "png"))
-    folder.mkdir(parents=True, exist_ok=True)
-    write_text(markdown, "\n".join(_markdown(results)) + "\n")
-    write_text(table, _csv(results))
-    _plot(results, plot)
-    return [markdown, table, plot]
+    text = "\n".join(_markdown(results)) + "\n"
+    return _write_report(folder, PAPER_REPORT, [text.encode(), _csv(results).encode(), _plot(results)], force)
 
 
 def _row_title(row: PaperRow) -> str:
@@ -223,8 +263,9 @@ def _csv_row(case: Case, found: dict[str, Any], shape: str) -> dict[str, object]
     return {name: f"{value:.5g}" if isinstance(value, float) else value for name, value in line.items()}
 
 
-def _plot(results: Sequence[PaperResult], path: Path) -> None:
-    """Plot mAP 0.5 and F1 over the noise of the tests, for each mapper and reading, with the paper's values."""
+def _plot(results: Sequence[PaperResult]) -> bytes:
+    """Plot mAP 0.5 and F1 over the noise of the tests, for each mapper and reading, with the paper's values (PNG)."""
+    use_temporary_folders()
     from matplotlib.figure import Figure
 
     readings = list(dict.fromkeys(case.reading for case, _, _ in results))
@@ -249,7 +290,9 @@ def _plot(results: Sequence[PaperResult], path: Path) -> None:
             axis.grid(alpha=0.3)
             if axis.get_legend_handles_labels()[0]:
                 axis.legend(fontsize=7)
-    figure.savefig(path, dpi=110)
+    content = io.BytesIO()
+    figure.savefig(content, dpi=110, metadata={"Software": "prim-eval"})
+    return content.getvalue()
 
 
 SHIPPED_INTRODUCTION = """\
@@ -282,21 +325,21 @@ SHIPPED_ERRORS = ("position_mm", "width_mm", "height_mm", "median_angle_deg")
 """Those that are errors; the others are shares."""
 
 
-def write_shipped_report(results: Sequence[ShippedResult], folder: Path) -> list[Path]:
+def write_shipped_report(results: Sequence[ShippedResult], folder: Path, force: bool = False) -> list[Path]:
     """Write shipped.md and shipped.csv.
 
     Args:
         results: Results of the shipped weights' suite.
         folder: Where they go.
+        force: Whether files may be replaced that are no earlier report.
 
     Returns:
         Their paths.
 
     Raises:
         OutputError: A file cannot be written.
+        UsageError: There is another file in the place of one.
     """
-    folder.mkdir(parents=True, exist_ok=True)
-    markdown, table = folder / "shipped.md", folder / "shipped.csv"
     titles = SHIPPED_COLUMNS.values()
     lines = [SHIPPED_INTRODUCTION, "", f"| recorded | noise (mm) | mapper | sessions | {' | '.join(titles)} |"]
     lines.append("|---|---:|---|" + "---:|" * (1 + len(titles)))
@@ -309,9 +352,8 @@ def write_shipped_report(results: Sequence[ShippedResult], folder: Path) -> list
         lines.append(f"| {condition.name} | {condition.noise_mm} | {mapper} | {sessions} | {' | '.join(cells)} |")
         texts = ("" if value is None else f"{value:.5g}" for value in values.values())
         writer.writerow((condition.name, condition.noise_mm / 1000, mapper, sessions, *texts))
-    write_text(markdown, "\n".join(lines) + "\n")
-    write_text(table, text.getvalue())
-    return [markdown, table]
+    markdown = "\n".join(lines) + "\n"
+    return _write_report(folder, SHIPPED_REPORT, [markdown.encode(), text.getvalue().encode()], force)
 
 
 def shipped_summary(results: Sequence[ShippedResult], mode: str, mapper: str) -> str:

@@ -15,12 +15,12 @@ interrupted run can be continued. In ``detect`` only training and evaluation use
 
 from __future__ import annotations
 
-import os
 import re
 import tempfile
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import asdict, dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -186,7 +186,9 @@ def make_dataset(
     with ProcessPoolExecutor(workers or cores()) as pool:
         futures = [pool.submit(_make_session, folder, options, split, seed) for split, seed in missing]
         for count, future in enumerate(as_completed(futures), start=1):
-            future.result()
+            if failed := future.result():
+                pool.shutdown(cancel_futures=True)
+                raise OutputError(*failed)
             if progress:
                 progress(count, len(missing))
     for mapper in options.mappers:
@@ -199,7 +201,7 @@ def _prepare_folder(folder: Path, options: DatasetOptions) -> None:
     manifest = strict_json.dumps({"version": 1, "tile": TILE_SIZE} | asdict(options), indent=1) + "\n"
     path = folder / "manifest.json"
     try:
-        if path.exists() and path.read_text(encoding="utf-8") != manifest:
+        if path.exists() and path.read_bytes() != manifest.encode():
             raise UsageError(f"{folder} holds a set that was made with other options: give another folder")
         for split in SPLITS:
             (folder / "truth" / split).mkdir(parents=True, exist_ok=True)
@@ -207,9 +209,9 @@ def _prepare_folder(folder: Path, options: DatasetOptions) -> None:
             for mapper in options.mappers:
                 for kind in ("images", "labels"):
                     (folder / kind / mapper / split).mkdir(parents=True, exist_ok=True)
-        path.write_text(manifest, encoding="utf-8")
     except OSError as error:
         raise OutputError(folder, error) from error
+    write_file(path, manifest.encode(), OF_THE_SET)
 
 
 def _done(folder: Path, split: str, seed: int) -> Path:
@@ -217,7 +219,29 @@ def _done(folder: Path, split: str, seed: int) -> Path:
     return folder / "done" / split / f"{seed:06d}"
 
 
-def _make_session(folder: Path, options: DatasetOptions, split: str, seed: int) -> None:
+def _make_session(folder: Path, options: DatasetOptions, split: str, seed: int) -> tuple[str, OSError] | None:
+    """Make one session in a process of its own; return the file that cannot be written, and why."""
+    return output_failure(partial(_write_session, folder, options, split, seed))
+
+
+def output_failure(write: Callable[[], None]) -> tuple[str, OSError] | None:
+    """Write files in a worker process, whose errors cannot be sent as they are.
+
+    Args:
+        write: Writes them.
+
+    Returns:
+        The arguments of the OutputError that was raised; None where there was none.
+    """
+    try:
+        write()
+    except OutputError as error:
+        cause = error.__cause__
+        return error.path, cause if isinstance(cause, OSError) else OSError(str(error))
+    return None
+
+
+def _write_session(folder: Path, options: DatasetOptions, split: str, seed: int) -> None:
     """Record and map one session, and write its tiles."""
     session = session_options(options, seed)
     world, scans = simulate_session(session)
@@ -232,7 +256,7 @@ def _make_session(folder: Path, options: DatasetOptions, split: str, seed: int) 
             style = "rounded" if mapper in options.rounded else "grey"
             write_image(folder / "images" / mapper / split / f"{name}.png", tile_image(grid, tile, style))
             label = "".join(yolo_label(primitive, tile) for primitive in primitives)
-            (folder / "labels" / mapper / split / f"{name}.txt").write_text(label, encoding="utf-8")
+            write_file(folder / "labels" / mapper / split / f"{name}.txt", label.encode(), OF_THE_SET)
         truth = {
             "frame": asdict(tile),
             "primitives": [primitive.to_json() for primitive in primitives],
@@ -241,8 +265,8 @@ def _make_session(folder: Path, options: DatasetOptions, split: str, seed: int) 
             "motion": session.motion,
             "scans": len(scans),
         }
-        (folder / "truth" / split / f"{name}.json").write_text(strict_json.dumps(truth), encoding="utf-8")
-    _done(folder, split, seed).touch()
+        write_file(folder / "truth" / split / f"{name}.json", strict_json.dumps(truth).encode(), OF_THE_SET)
+    write_file(_done(folder, split, seed), b"", OF_THE_SET)
 
 
 def map_frame(world: World, resolution: float) -> GridFrame:
@@ -371,15 +395,16 @@ def bounding_box(primitive: Primitive, tile: GridFrame) -> Box:
 
 
 def write_image(path: Path, image: NDArray[np.uint8]) -> None:
-    """Write a PNG image atomically.
+    """Write a PNG image of a data set.
 
     Args:
         path: Its file.
         image: (rows, cols, 3).
+
+    Raises:
+        OutputError: It cannot be written.
     """
-    part = path.with_suffix(f".{os.getpid()}.part")
-    part.write_bytes(cv2.imencode(".png", cv2.cvtColor(image, cv2.COLOR_RGB2BGR))[1].data)
-    part.replace(path)
+    write_file(path, cv2.imencode(".png", cv2.cvtColor(image, cv2.COLOR_RGB2BGR))[1].tobytes(), OF_THE_SET)
 
 
 def data_description(folder: Path, mapper: str) -> str:

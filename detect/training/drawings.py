@@ -20,10 +20,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from detect.networks.tiles import TILE_SIZE, Box
-from detect.training.dataset import SPLITS, Progress, bounding_box, write_data_yaml, write_image, yolo_label
+from detect.training.dataset import (
+    OF_THE_SET,
+    SPLITS,
+    Progress,
+    bounding_box,
+    output_failure,
+    write_data_yaml,
+    write_image,
+    yolo_label,
+)
 from mapping.grid import UNKNOWN_GREY, GridFrame
 from prim import strict_json
-from prim.errors import UsageError
+from prim.errors import OutputError, UsageError
+from prim.files import output_errors, write_file
 from prim.shapes import Kind, Primitive
 
 DRAWINGS = "drawings"
@@ -86,19 +96,24 @@ def make_drawings(folder: Path, options: DrawingOptions, progress: Progress | No
         How many drawings were made now.
 
     Raises:
+        OutputError: The folder cannot be written.
         UsageError: The folder holds a data set with other options.
     """
     manifest = strict_json.dumps({"version": 2, "tile": TILE_SIZE} | vars(options)) + "\n"
     path = folder / "manifest.json"
-    if path.exists() and path.read_text(encoding="utf-8") != manifest:
-        raise UsageError(f"{folder} holds a set that was made with other options: give another folder")
-    for split in SPLITS:
-        for kind in ("images", "labels"):
-            (folder / kind / DRAWINGS / split).mkdir(parents=True, exist_ok=True)
-    path.write_text(manifest, encoding="utf-8")
+    with output_errors(folder):
+        if path.exists() and path.read_bytes() != manifest.encode():
+            raise UsageError(f"{folder} holds a set that was made with other options: give another folder")
+        for split in SPLITS:
+            for kind in ("images", "labels"):
+                (folder / kind / DRAWINGS / split).mkdir(parents=True, exist_ok=True)
+    write_file(path, manifest.encode(), OF_THE_SET)
     missing = [job for job in _drawing_seeds(options) if not _image_path(folder, *job).exists()]
     with ProcessPoolExecutor(len(os.sched_getaffinity(0))) as pool:
-        for done, _ in enumerate(pool.map(partial(_write_drawing, folder), missing, chunksize=50), start=1):
+        for done, failed in enumerate(pool.map(partial(_make_drawing, folder), missing, chunksize=50), start=1):
+            if failed:
+                pool.shutdown(cancel_futures=True)
+                raise OutputError(*failed)
             if progress:
                 progress(done, len(missing))
     write_data_yaml(folder, DRAWINGS)
@@ -117,11 +132,16 @@ def _image_path(folder: Path, split: str, seed: int) -> Path:
     return folder / "images" / DRAWINGS / split / f"{seed:06d}.png"
 
 
+def _make_drawing(folder: Path, job: tuple[str, int]) -> tuple[str, OSError] | None:
+    """Make a drawing in a process of its own; return the file that cannot be written, and why."""
+    return output_failure(partial(_write_drawing, folder, job))
+
+
 def _write_drawing(folder: Path, job: tuple[str, int]) -> None:
     split, seed = job
     image, primitives = draw_primitives(np.random.default_rng(seed))
     label = "".join(yolo_label(primitive, FRAME) for primitive in primitives)
-    (folder / "labels" / DRAWINGS / split / f"{seed:06d}.txt").write_text(label, encoding="utf-8")
+    write_file(folder / "labels" / DRAWINGS / split / f"{seed:06d}.txt", label.encode(), OF_THE_SET)
     write_image(_image_path(folder, split, seed), image)
 
 

@@ -7,9 +7,12 @@ network's outputs unchanged.
 
 from __future__ import annotations
 
+import io
+import re
 import shutil
 import tempfile
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -18,11 +21,18 @@ import torch
 
 from detect.networks.parameters import PRESETS
 from detect.networks.tiles import TILE_SIZE
-from detect.networks.weights import CARD_KEY, ModelCard
+from detect.networks.weights import CARD_KEY, DETECTOR_FILE, SCHEMA, ModelCard
 from detect.training.model import ParameterNetwork
 from detect.training.offline import load_ultralytics
 from prim.errors import UsageError
+from prim.files import ResultFormat, check_no_input, check_output, write_file
 from prim.shapes import Kind
+
+NETWORK = ResultFormat("a network of prim-train", re.compile(re.escape(SCHEMA.encode())), at_end=True)
+"""Networks are known by their model cards, which follow the weights."""
+
+TRAINED = ResultFormat("weights of a run", re.compile(b""))
+"""They lie in the folder of a run, which is claimed first."""
 
 OPSET = 17
 """Version of ONNX's operator set."""
@@ -34,7 +44,33 @@ MIN_HALVED_SIZE = 256
 """Arrays with fewer numbers (biases, arithmetic constants) stay in single precision; set by hand."""
 
 
-def export_cnn(checkpoint: Path, mapper: str, output: Path, about: Mapping[str, Any] | None = None) -> ModelCard:
+@contextmanager
+def network_in_the_making(weights: Path, output: Path, force: bool = False) -> Iterator[Path]:
+    """Make an ONNX file in a temporary folder, and put it in its place when it is complete.
+
+    Args:
+        weights: What it is made of.
+        output: Its place.
+        force: Whether a file in its place may be replaced that is no network of prim-train.
+
+    Yields:
+        Where it is to be made.
+
+    Raises:
+        OutputError: It cannot be written.
+        UsageError: There is another file in its place, or ``weights`` itself.
+    """
+    check_no_input([weights], [output])
+    check_output(output, NETWORK, force)
+    with tempfile.TemporaryDirectory() as folder:
+        made = Path(folder) / DETECTOR_FILE
+        yield made
+        write_file(output, made.read_bytes(), NETWORK, force)
+
+
+def export_cnn(
+    checkpoint: Path, mapper: str, output: Path, about: Mapping[str, Any] | None = None, force: bool = False
+) -> ModelCard:
     """Export a checkpoint of ``prim-train cnn``: crops (N, channels, pixels, pixels) to outputs (N, M).
 
     Args:
@@ -42,12 +78,15 @@ def export_cnn(checkpoint: Path, mapper: str, output: Path, about: Mapping[str, 
         mapper: Name of the mapper whose maps it was trained on.
         output: The ONNX file to write.
         about: Further entries of the model card's ``about``.
+        force: Whether a file may be replaced that is no network of prim-train.
 
     Returns:
         The model card.
 
     Raises:
-        UsageError: The file is no such checkpoint, or is for another mapper's maps.
+        OutputError: The file cannot be written.
+        UsageError: The file is no such checkpoint, or is for another mapper's maps; or another file is in the place
+            of ``output``.
     """
     network, state = _read_checkpoint(checkpoint)
     if state["mapper"] != mapper:
@@ -57,18 +96,19 @@ def export_cnn(checkpoint: Path, mapper: str, output: Path, about: Mapping[str, 
     kinds = tuple(kind.value for kind in network.kinds)
     entries = {"options": state["options"]} | dict(about or {})
     card = ModelCard("cnn", mapper, kinds, network.preset.name, network.channels, state["style"], about=entries)
-    torch.onnx.export(
-        network,
-        (torch.zeros(2, network.channels, pixels, pixels),),
-        str(output),
-        input_names=["crops"],
-        output_names=["outputs"],
-        dynamic_axes={"crops": {0: "n"}, "outputs": {0: "n"}},
-        opset_version=OPSET,
-        dynamo=False,
-    )
-    store_half_precision(output)
-    write_card(output, card)
+    with network_in_the_making(checkpoint, output, force) as made:
+        torch.onnx.export(
+            network,
+            (torch.zeros(2, network.channels, pixels, pixels),),
+            str(made),
+            input_names=["crops"],
+            output_names=["outputs"],
+            dynamic_axes={"crops": {0: "n"}, "outputs": {0: "n"}},
+            opset_version=OPSET,
+            dynamo=False,
+        )
+        store_half_precision(made)
+        write_card(made, card)
     return card
 
 
@@ -98,7 +138,7 @@ def export_yolo(
     Args:
         weights: Weights of ultralytics: a pickle, which can run code when it is loaded.
         mapper: Name of the mapper whose maps they were trained on.
-        output: The ONNX file to write.
+        output: The ONNX file to write, see :func:`network_in_the_making`.
         trust: Whether the pickle may be loaded.
         style: Style of the images (networks.tiles.STYLES).
         about: The model card's ``about``.
@@ -152,7 +192,9 @@ def import_yolo(path: Path, images: torch.Tensor, output: Path) -> Path:
     except (KeyError, RuntimeError) as error:
         raise UsageError(f"{path} is no YOLOv5n of {len(Kind)} kinds") from error
     _set_statistics(model, images)
-    torch.save({"model": model, "epoch": -1, "train_args": {}}, output)
+    content = io.BytesIO()
+    torch.save({"model": model, "epoch": -1, "train_args": {}}, content)
+    write_file(output, content.getvalue(), TRAINED)
     return output
 
 

@@ -23,7 +23,7 @@ def load_ultralytics() -> Any:
     Returns:
         The package.
     """
-    _use_temporary_folders()
+    use_temporary_folders()
     os.environ["YOLO_AUTOINSTALL"] = "false"
     os.environ["YOLO_OFFLINE"] = "true"
     import ultralytics
@@ -36,8 +36,11 @@ def load_ultralytics() -> Any:
     return ultralytics
 
 
-def _use_temporary_folders() -> None:
-    """Name a folder that is removed at the end of the process where the user has named none."""
+def use_temporary_folders() -> None:
+    """Let ultralytics and matplotlib keep their settings in a folder that is removed at the end of the process.
+
+    Call it before they are imported. What the user has named stays.
+    """
     missing = [name for name in FOLDERS if name not in os.environ]
     if missing:
         folder = tempfile.mkdtemp(prefix="prim-train-")

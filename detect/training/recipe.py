@@ -132,11 +132,10 @@ def train_weights(
     """
     if (folder / DETECTOR_FILE).exists():
         return folder
-    from detect.training.export import export_cnn, export_yolo
+    from detect.training.export import export_cnn
     from detect.training.train import CNN_PRESETS, YOLO_PRESETS, checkpoint_name, network_kinds, train_cnn, train_yolo
 
     folder.mkdir(parents=True, exist_ok=True)
-    style = image_style(data, mapper)
     with announce_duration(f"{folder.name}: YOLO", announce):
         options = replace(YOLO_PRESETS[preset], start=start, trust=True)
         best = train_yolo(data, mapper, folder / "yolo", options)
@@ -146,11 +145,39 @@ def train_weights(
         with announce_duration(f"{folder.name}: {name}", announce):
             train_cnn(data, mapper, kinds, checkpoint, replace(CNN_PRESETS[preset], start=cnn_start))
         export_cnn(checkpoint, mapper, folder / f"{name}.onnx", about)
-    part = folder / "yolo.part"
-    export_yolo(best, mapper, part, True, style, about)
-    store_thresholds(part, data)
-    part.replace(folder / DETECTOR_FILE)
+    export_detector(best, mapper, data, folder / DETECTOR_FILE, True, about)
     return folder
+
+
+def export_detector(
+    weights: Path,
+    mapper: str,
+    data: Path,
+    output: Path,
+    trust: bool,
+    about: Mapping[str, Any] | None = None,
+    force: bool = False,
+) -> None:
+    """Export YOLO's weights with score thresholds, see :func:`detect.training.export.export_yolo`.
+
+    Args:
+        weights: Weights of ultralytics.
+        mapper: Name of the mapper whose maps they were trained on.
+        data: Folder of the data set that they were trained on; thresholds are chosen on its validation split.
+        output: The ONNX file to write.
+        trust: Whether ``weights``, a pickle, may be loaded.
+        about: The model card's ``about``.
+        force: Whether a file may be replaced that is no network of prim-train.
+
+    Raises:
+        OutputError: The file cannot be written.
+        UsageError: ``weights`` are not trusted or not there; or another file is in the place of ``output``.
+    """
+    from detect.training.export import export_yolo, network_in_the_making
+
+    with network_in_the_making(weights, output, force) as made:
+        export_yolo(weights, mapper, made, trust, image_style(data, mapper), about)
+        store_thresholds(made, data)
 
 
 def store_thresholds(yolo: Path, data: Path) -> None:

@@ -111,6 +111,26 @@ def test_an_interrupted_run_must_be_trusted_to_go_on(run: Run, command: str) -> 
     assert not Path("ran").exists()
 
 
+def test_an_export_replaces_networks_alone_and_never_its_input(run: Run) -> None:
+    pytest.importorskip("torch", reason="needs the extra [train]")
+    run("dataset", "set", "--maps", 2, 1, "--mapper", "prob", "--kind", "circle", "--noise-std", 0.0)
+    run("cnn", "set", "out", "--mapper", "prob", "--kind", "circle", "--epochs", 1)
+    checkpoint, notes = Path("out") / "cnn.prob.circle.pt", Path("notes.txt")
+    notes.write_text("mine")
+    before = checkpoint.read_bytes()
+    options = ("--stage", "cnn", "--mapper", "prob")
+    for force in ([], ["--force"]):
+        code, _, err = run("export", checkpoint, checkpoint, *options, *force)
+        assert code == 2 and "the input" in err and checkpoint.read_bytes() == before
+    code, _, err = run("export", checkpoint, notes, *options)
+    assert code == 2 and "--force" in err and err.count("\n") == 1 and notes.read_text() == "mine"
+    for force in ([], [], ["--force"]):
+        assert run("export", checkpoint, notes if force else "a.onnx", *options, *force)[0] == 0
+    assert notes.read_bytes() == Path("a.onnx").read_bytes()
+    code, _, err = run("export", checkpoint, Path("none") / "a.onnx", *options)
+    assert code == 1 and "cannot write" in err and err.count("\n") == 1
+
+
 def test_exported_weights_need_no_trust(run: Run) -> None:
     """They cannot run code; the missing data set is reported next."""
     pytest.importorskip("torch", reason="needs the extra [train]")
@@ -158,6 +178,7 @@ def test_training_starts_from_given_weights(run: Run) -> None:
     assert "--set" in run(*command)[2] and "--trust" in run(*command, "--set", "set")[2]
     assert run(*command, "--set", "set", "--trust")[0] == 0
     exported = load_weights(Path("yolo.onnx"), "yolo", "det")
+    assert run(*command, "--set", "set", "--trust")[0] == 0  # an earlier network is replaced
     assert set(exported.card.thresholds) == {"circle"} and exported.card.style == "rounded"
     images = np.random.default_rng(0).random((2, 3, TILE_SIZE, TILE_SIZE), dtype=np.float32)
     model = torch.load(start, weights_only=False)["model"].float().eval()

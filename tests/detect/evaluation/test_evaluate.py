@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from detect import cli
 from detect.detection import Detection, Detections, Rejection
 from detect.detector import Detector
 from detect.evaluation import suites, tables
@@ -31,6 +32,7 @@ from detect.networks.weights import KIND_NAMES, SHIPPED, ModelCard
 from detect.networks.yolo import KINDS
 from detect.training.dataset import DatasetOptions, bounding_box, load_samples, make_dataset, read_image
 from detect.training.thresholds import choose_thresholds
+from prim import console
 from prim.errors import UsageError
 from prim.shapes import Kind, Primitive
 from tests.detect.fakes import constant, weights
@@ -128,6 +130,7 @@ def test_the_papers_report(tmp_path: Path) -> None:
     lines = list(csv.DictReader(table.read_text("utf-8").splitlines()))
     assert len(lines) == 26 * 6 and float(lines[0]["paper_f1"]) == 0.8 and float(lines[0]["true_box_width"]) == 10
     assert plot.stat().st_size > 10_000
+    assert tables.write_paper_report(results[:3], tmp_path) == [markdown, table, plot]  # earlier ones are recognised
 
 
 def test_a_suite_is_continued(tmp_path: Path) -> None:
@@ -187,6 +190,36 @@ def test_the_shipped_weights_report(tmp_path: Path) -> None:
     assert len(lines) == 7 + 4 * 3 and {line["recorded"] for line in lines} == set(RecordingMode)
     assert lines[0]["position_mm"] == "" and lines[0]["networks_f1"] == "0.9"
     assert (lines[0]["map50"], lines[0]["weighted_map50"]) == ("0.45", "0.9")
+
+
+def test_a_report_does_not_replace_what_is_none(tmp_path: Path) -> None:
+    """Earlier reports are replaced; another file stays, and then nothing is written at all."""
+    results = [(next(suites.conditions(500)), "forward", 500, sessions_json(0.9))]
+    for _ in range(2):
+        markdown, table = tables.write_shipped_report(results, tmp_path)
+    markdown.unlink()
+    table.write_text("my,own\n")
+    with pytest.raises(UsageError, match=r"shipped\.csv exists and is not a table of prim-eval"):
+        tables.write_shipped_report(results, tmp_path)
+    assert table.read_text() == "my,own\n" and not markdown.exists()
+    tables.write_shipped_report(results, tmp_path, force=True)
+    assert markdown.exists() and table.read_text().startswith("recorded,")
+
+
+def test_a_report_has_its_place_before_the_work_begins(
+    in_tmp: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(suites.ShippedSuite, "run", lambda *arguments: pytest.fail("evaluated"))
+    Path("w/report").mkdir(parents=True)
+    Path("w/report/shipped.md").write_text("my own")
+    assert console.run(cli.evaluation, "prim-eval", ["w", "--suite", "shipped"]) == 2
+    assert "--force" in capsys.readouterr().err and Path("w/report/shipped.md").read_text() == "my own"
+
+
+def test_a_damaged_result_is_named(tmp_path: Path) -> None:
+    (tmp_path / "a.json").write_text('{"images": ')
+    with pytest.raises(UsageError, match=r"a\.json is damaged"):
+        suites.read_result(tmp_path / "a.json")
 
 
 def test_results_without_the_mean_average_precision_of_what_is_reported_have_a_dash(tmp_path: Path) -> None:

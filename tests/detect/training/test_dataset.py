@@ -20,7 +20,7 @@ from detect.training.dataset import (
     session_seeds,
     write_image,
 )
-from prim.errors import UsageError
+from prim.errors import OutputError, UsageError
 from prim.shapes import Kind
 
 SMALL = DatasetOptions(
@@ -116,3 +116,29 @@ def test_crops_of_a_data_set_are_its_primitives(small: Path) -> None:
 def test_impossible_options_are_refused(options: dict[str, object]) -> None:
     with pytest.raises(UsageError):
         DatasetOptions(**options)  # type: ignore[arg-type]
+
+
+def test_files_of_a_set_are_replaced_whole(tmp_path: Path) -> None:
+    """Who reads an earlier one, by a link to it here, does not see it change."""
+    options = DatasetOptions((1, 0), mappers=("det",), kinds=("circle",), seed=3)
+    make_dataset(tmp_path / "set", options)
+    (done,) = (tmp_path / "set" / "done" / "train").iterdir()
+    written = [path for path in (tmp_path / "set").rglob("*") if path.is_file() and path.parent != done.parent]
+    (tmp_path / "links").mkdir()
+    links = [tmp_path / "links" / f"{number}" for number in range(len(written))]
+    for path, link in zip(written, links, strict=True):
+        link.hardlink_to(path)
+    done.unlink()
+    make_dataset(tmp_path / "set", options)
+    for path, link in zip(written, links, strict=True):
+        assert not link.samefile(path) and link.read_bytes() == path.read_bytes()
+    assert not list((tmp_path / "set").rglob("*.part"))
+
+
+def test_a_file_that_cannot_be_written_is_named(tmp_path: Path) -> None:
+    """By the process that makes a session, whose errors come from another one."""
+    options = DatasetOptions((1, 0), mappers=("det",), kinds=("circle",), seed=3)
+    place = tmp_path / "images" / "det" / "train" / "000003_0.png"
+    place.mkdir(parents=True)
+    with pytest.raises(OutputError, match=r"000003_0\.png: cannot write"):
+        make_dataset(tmp_path, options)

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from detect.networks.tiles import TILE_SIZE
 from detect.training.drawings import FRAME, DrawingOptions, draw_primitives, make_drawings
-from prim.errors import UsageError
+from prim.errors import OutputError, UsageError
 
 
 def test_outlines_are_mostly_occupied_and_what_they_enclose_unknown() -> None:
@@ -44,3 +44,10 @@ def test_drawings_are_continued(tmp_path: Path) -> None:
     assert make_drawings(tmp_path, options) == 1 and first.read_bytes() == before
     with pytest.raises(UsageError, match="other options"):
         make_drawings(tmp_path, DrawingOptions(sizes=(3, 1), seed=6))
+
+
+def test_a_drawing_that_cannot_be_written_is_named(tmp_path: Path) -> None:
+    (tmp_path / "images" / "drawings" / "train" / "000005.png" / "folder").mkdir(parents=True)
+    (tmp_path / "labels" / "drawings" / "train" / "000006.txt").mkdir(parents=True)
+    with pytest.raises(OutputError, match=r"000006\.txt: cannot write"):
+        make_drawings(tmp_path, DrawingOptions(sizes=(2, 0), seed=5))
