@@ -126,9 +126,9 @@ def speed(detector: Detector, case: Case, yolo: Path | None) -> list[str]:
         "OpenCV contours": lambda: classical.detect(case.grid),
     }
     if yolo is not None:
-        from ultralytics import YOLO
+        from detect.training.offline import load_ultralytics
 
-        model = YOLO(str(yolo))
+        model = load_ultralytics().YOLO(str(yolo))
         calls["ultralytics predict: YOLO alone"] = lambda: model.predict(image, imgsz=224, verbose=False)
     times = timed(calls)
     ours = times["**prim**: map to primitives, all networks"]

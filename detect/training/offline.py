@@ -18,7 +18,8 @@ def load_ultralytics() -> Any:
     """Import ultralytics; the only way to do so.
 
     Its settings and matplotlib's lie in a temporary folder until the process ends; worker processes inherit that. It
-    opens no connection, reports to no tracker of experiments, and unpickles no list of labels of a data set.
+    opens no connection, uploads nothing, reports to no tracker of experiments, and unpickles no list of labels of a
+    data set.
 
     Returns:
         The package.
@@ -28,9 +29,11 @@ def load_ultralytics() -> Any:
     os.environ["YOLO_OFFLINE"] = "true"
     import ultralytics
     from ultralytics.data import dataset, utils
+    from ultralytics.utils.callbacks import platform
 
     switches = {name: False for name, value in ultralytics.settings.items() if value is True}
     dict.update(ultralytics.settings, switches)  # for this process: its own update would write them to a file
+    platform.callbacks.clear()  # they upload a run where there is a key, offline or not
     dataset.load_dataset_cache_file = _refuse_cache
     utils.check_font = _find_no_font
     return ultralytics
