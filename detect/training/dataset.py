@@ -482,17 +482,20 @@ def image_style(folder: Path, mapper: str) -> str:
         UsageError: The folder holds no data set.
     """
     try:
-        manifest = strict_json.loads((folder / "manifest.json").read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
+        manifest = strict_json.loads((folder / "manifest.json").read_bytes())
+        return "rounded" if mapper in manifest.get("rounded", ()) else "grey"
+    except (OSError, ValueError, TypeError, AttributeError) as error:
         raise UsageError(f"{folder} holds no set: make one with prim-train dataset") from error
-    return "rounded" if mapper in manifest.get("rounded", ()) else "grey"
 
 
 def _read_sample(folder: Path, mapper: str, split: str, path: Path) -> Sample:
-    truth: dict[str, Any] = strict_json.loads(path.read_text(encoding="utf-8"))
-    primitives = tuple(Primitive.from_json(value) for value in truth["primitives"])
     image = folder / "images" / mapper / split / f"{path.stem}.png"
-    return Sample(image, GridFrame(**truth["frame"]), primitives, truth["noise_std"])
+    try:
+        truth: dict[str, Any] = strict_json.loads(path.read_bytes())
+        primitives = tuple(Primitive.from_json(value) for value in truth["primitives"])
+        return Sample(image, GridFrame(**truth["frame"]), primitives, truth["noise_std"])
+    except (OSError, ValueError, TypeError, KeyError, AttributeError) as error:
+        raise UsageError(f"{path} is damaged: make the set in an empty folder with prim-train dataset") from error
 
 
 def read_image(sample: Sample) -> NDArray[np.uint8]:

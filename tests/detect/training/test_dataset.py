@@ -13,6 +13,7 @@ import pytest
 from detect.training.crops import collect_crops
 from detect.training.dataset import (
     DatasetOptions,
+    image_style,
     load_samples,
     make_dataset,
     read_image,
@@ -116,6 +117,18 @@ def test_crops_of_a_data_set_are_its_primitives(small: Path) -> None:
 def test_impossible_options_are_refused(options: dict[str, object]) -> None:
     with pytest.raises(UsageError):
         DatasetOptions(**options)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("content", ["", "[]", "{}", '{"primitives": [{}], "frame": {}, "noise_std": 0}', "\xff"])
+def test_a_damaged_set_is_named(tmp_path: Path, content: str) -> None:
+    for name in ("truth/train/000003_0.json", "det.yaml", "manifest.json"):
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / name).write_text(content, encoding="latin-1")
+    with pytest.raises(UsageError, match=r"000003_0\.json is damaged"):
+        load_samples(tmp_path, "det", "train")
+    if content[:1] != "{":
+        with pytest.raises(UsageError, match="holds no set"):
+            image_style(tmp_path, "det")
 
 
 def test_files_of_a_set_are_replaced_whole(tmp_path: Path) -> None:
