@@ -54,7 +54,8 @@ def principal_axes(matrix: Matrix) -> tuple[FloatArray, FloatArray] | None:
     if not np.isfinite(matrix).all():
         return None
     try:
-        values, vectors = np.linalg.eigh(matrix)
+        with np.errstate(all="ignore"):
+            values, vectors = np.linalg.eigh(matrix)
     except np.linalg.LinAlgError:
         return None
     return np.asarray(values, dtype=float), np.asarray(vectors, dtype=float)
@@ -80,7 +81,8 @@ def log_determinant(matrix: Matrix) -> float | None:
     """Return the logarithm of the determinant of a matrix (K, K); None where it is not positive and finite."""
     if not np.isfinite(matrix).all():
         return None
-    sign, logarithm = np.linalg.slogdet(matrix)
+    with np.errstate(all="ignore"):  # a denormal pivot counts as 0 in some versions: that is not finite either
+        sign, logarithm = np.linalg.slogdet(matrix)
     return float(logarithm) if sign > 0 and np.isfinite(logarithm) else None
 
 
