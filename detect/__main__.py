@@ -2,23 +2,23 @@
 
 from __future__ import annotations
 
-from prim.interrupts import no_traceback_when_interrupted
+from prim.interrupts import end_when_interrupted
 
 
 def main() -> None:
     """Run prim-train."""
-    with no_traceback_when_interrupted("prim-train"):
-        from detect.cli import main as run
+    end_when_interrupted("prim-train")
+    from detect.cli import main as run
 
-        run()
+    run()
 
 
 def main_eval() -> None:
     """Run prim-eval."""
-    with no_traceback_when_interrupted("prim-eval"):
-        from detect.cli import main_eval as run
+    end_when_interrupted("prim-eval")
+    from detect.cli import main_eval as run
 
-        run()
+    run()
 
 
 if __name__ == "__main__":

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 
 class PrimError(Exception):
@@ -13,6 +14,14 @@ class PrimError(Exception):
     """
 
     exit_code = 1
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Let an error come out of a worker process, whatever arguments its class is made with."""
+        return _without_init, (type(self), self.args), self.__dict__
+
+
+def _without_init(kind: type[PrimError], arguments: tuple[Any, ...]) -> PrimError:
+    return kind.__new__(kind, *arguments)
 
 
 class UsageError(PrimError):

@@ -210,14 +210,32 @@ def write_file(path: Path, content: bytes, result: ResultFormat, force: bool = F
         OutputError: It cannot be written.
         UsageError: There is another file in its place.
     """
-    file = OutputFile(path, result, force)
+    write_files([(path, content, result)], force)
+
+
+def write_files(files: Sequence[tuple[Path, bytes, ResultFormat]], force: bool = False) -> None:
+    """Write files that belong together: none is put in its place before all are complete.
+
+    Args:
+        files: Of each one its path, its content and its format.
+        force: Whether files in their places may be replaced that are no earlier results.
+
+    Raises:
+        OutputError: One cannot be written.
+        UsageError: There is another file in the place of one.
+    """
+    complete: list[OutputFile] = []
     try:
-        with output_errors(path):
-            file.part.write_bytes(content)
+        for path, content, result in files:
+            complete.append(OutputFile(path, result, force))
+            with output_errors(path):
+                complete[-1].part.write_bytes(content)
     except BaseException:
-        file.discard()
+        for file in complete:
+            file.discard()
         raise
-    file.commit()
+    for file in complete:
+        file.commit()
 
 
 @contextmanager

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import signal
-import sys
 import threading
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
@@ -140,18 +139,19 @@ def interrupted_run(error: KeyboardInterrupt, what: str) -> InterruptedRunError:
     return InterruptedRunError(f"interrupted: {what}", exit_code)
 
 
-@contextmanager
-def no_traceback_when_interrupted(name: str) -> Iterator[None]:
-    """End the process by one line where it is interrupted while a command is still being loaded.
+def end_when_interrupted(name: str) -> None:
+    """Let an interruption end this process by one line at once, until :class:`Interrupts` act: nothing is made yet.
+
+    No exception is raised, for what is being loaded may drop it, or make another one of it.
 
     Args:
         name: The command's name.
-
-    Yields:
-        Nothing.
     """
-    try:
-        yield
-    except KeyboardInterrupt:
-        sys.stderr.write(f"{name}: error: interrupted\n")
-        raise SystemExit(128 + signal.SIGINT) from None
+
+    def end(number: int, frame: FrameType | None) -> None:
+        os.write(2, f"{name}: error: interrupted\n".encode())
+        os._exit(128 + number)
+
+    for number in SIGNALS:
+        if signal.getsignal(number) != signal.SIG_IGN:
+            signal.signal(number, end)

@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-from prim.interrupts import no_traceback_when_interrupted
+from prim.interrupts import end_when_interrupted
 
 
 def main() -> None:
     """Run prim-record."""
-    with no_traceback_when_interrupted("prim-record"):
-        from recorder.cli import main as run
+    end_when_interrupted("prim-record")
+    from recorder.cli import main as run
 
-        run()
+    run()
 
 
 if __name__ == "__main__":

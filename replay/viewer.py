@@ -236,15 +236,26 @@ class RerunViewer:
         """
         self._send_batch()
         self._log_static("summary", rr.TextDocument(summary_markdown(results), media_type=rr.MediaType.MARKDOWN))
-        try:
-            self._recording.flush(timeout_sec=FLUSH_SECONDS)
-        except Exception as error:  # rerun raises plain RuntimeErrors
+        error = self._close()
+        if error and (self._options.connect is None or self._output is None):
             self.abandon()
-            raise RecordingError(f"the recording could not be written in full: {printable(str(error))}") from error
-        self._recording.disconnect()  # a server keeps what it was sent
+            raise error
         if self._output is not None:
             _check_whole(self._output)
             self._output.commit()
+        if error:  # that a viewer has gone costs the file nothing
+            raise RecordingError(f"{error}; {self._options.save} is whole")
+
+    def _close(self) -> RecordingError | None:
+        """Close the recording; return the error if not all of it could be written or sent."""
+        error = None
+        try:
+            self._recording.flush(timeout_sec=FLUSH_SECONDS)
+        except Exception as cause:  # rerun raises plain RuntimeErrors
+            sent = "written" if self._options.connect is None else "sent"
+            error = RecordingError(f"the recording could not be {sent} in full: {printable(str(cause))}")
+        self._recording.disconnect()  # a server keeps what it was sent
+        return error
 
     def abandon(self) -> None:
         """Close the recording and remove its file; an earlier recording of that name stays as it was."""

@@ -9,7 +9,7 @@ import numpy as np
 
 from mapping.grid import OccupancyGrid
 from prim import strict_json
-from prim.files import ResultFormat, write_file
+from prim.files import ResultFormat, write_file, write_files
 from replay.outputs.report import report_json
 from replay.result import ReplayResult
 
@@ -71,9 +71,8 @@ def write_map(stem: Path, grid: OccupancyGrid, force: bool = False) -> None:
         f"resolution: {frame.resolution:g}\norigin: [{x:.9g}, {y:.9g}, 0]\nnegate: 0\n"
         f"occupied_thresh: {OCCUPIED_THRESHOLD}\nfree_thresh: {FREE_THRESHOLD}\n"
     )
-    pixels = np.flipud(image).tobytes()
-    write_file(pgm, f"P5\n{cols}  {rows}\n255\n".encode() + pixels, MAP_IMAGE, force)
-    write_file(yaml, description.encode(), MAP_DESCRIPTION, force)
+    pixels = f"P5\n{cols}  {rows}\n255\n".encode() + np.flipud(image).tobytes()
+    write_files([(pgm, pixels, MAP_IMAGE), (yaml, description.encode(), MAP_DESCRIPTION)], force)
 
 
 def write_trajectory(path: Path, result: ReplayResult, force: bool = False) -> None:

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from prim.errors import OutputError, UsageError
-from prim.files import OutputFile, ResultFormat, check_distinct, check_no_input, check_output, write_file
+from prim.files import OutputFile, ResultFormat, check_distinct, check_no_input, check_output, write_file, write_files
 
 LETTER = ResultFormat("a letter", re.compile(rb"Dear "))
 
@@ -40,6 +40,17 @@ def test_earlier_results_and_empty_files_are_replaced(tmp_path: Path, content: b
     write_file(tmp_path / "a", b"Dear reader", LETTER)
     assert (tmp_path / "a").read_bytes() == b"Dear reader"
     assert (tmp_path / "a").stat().st_mode & 0o777 == 0o640
+
+
+def test_of_files_that_belong_together_all_are_replaced_or_none(tmp_path: Path) -> None:
+    first, second = tmp_path / "a", tmp_path / "b"
+    write_files([(first, b"Dear first", LETTER), (second, b"Dear second", LETTER)])
+    second.unlink()
+    second.mkdir()
+    with pytest.raises(OutputError, match="b: cannot write"):
+        write_files([(first, b"Dear reader", LETTER), (second, b"Dear reader", LETTER)])
+    assert first.read_bytes() == b"Dear first"
+    assert set(tmp_path.iterdir()) == {first, second}
 
 
 def test_another_file_is_replaced_by_force_alone(tmp_path: Path) -> None:

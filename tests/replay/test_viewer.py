@@ -21,8 +21,9 @@ from replay.options import ReplayOptions
 from replay.pipeline import Pipeline
 from replay.result import ReplayResult
 from replay.selection import Selection
-from replay.viewer import RerunViewer
+from replay.viewer import RecordingError, RerunViewer
 from replay.viewing.protocol import ViewerOptions
+from replay.viewing.serving import RecordingServer
 
 RERUN = Path(sys.executable).with_name("rerun")
 SCREENSHOT = Path(__file__).parents[2] / "docs" / "screenshot.py"
@@ -55,6 +56,19 @@ def timed(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
 def recording(noisy_session: Session, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, ReplayResult]:
     path = tmp_path_factory.mktemp("rrd") / "a.rrd"
     return path, replayed(noisy_session.path, path, mapper="prob", map_every=5)
+
+
+def test_a_viewer_that_goes_away_is_an_error_and_costs_the_file_nothing(
+    tmp_path: Path, noisy_session: Session
+) -> None:
+    path, server = tmp_path / "a.rrd", RecordingServer("127.0.0.1")
+    viewer = RerunViewer(ViewerOptions(save=path, connect=server.addresses.recording), announce=print)
+    result = Pipeline(noisy_session.path, ReplayOptions(selection=Selection(n_scans=10)), viewer).run()
+    server.close()
+    with pytest.raises(RecordingError, match=r"could not be sent in full: .*; \S*a.rrd is whole$"):
+        viewer.finish([result])
+    assert len(timed(rows_of(path)["/map/scan"])) == 10
+    assert list(tmp_path.iterdir()) == [path]
 
 
 def test_the_recording_has_exactly_two_timelines(recording: tuple[Path, ReplayResult]) -> None:
