@@ -86,7 +86,7 @@ def _run(app: typer.Typer, name: str, arguments: Sequence[str], interrupts: Inte
 def _without_ignored_interruptions() -> Iterator[None]:
     """Print nothing of an interruption that came where Python is called from C and drops it: it is raised again."""
     before = sys.unraisablehook
-    sys.unraisablehook = lambda found: None if isinstance(found.exc_value, KeyboardInterrupt) else before(found)
+    sys.unraisablehook = lambda found: None if issubclass(found.exc_type, KeyboardInterrupt) else before(found)
     try:
         yield
     finally:

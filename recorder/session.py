@@ -182,7 +182,7 @@ def record_session(
     with interrupts.held(), LogWriter(path, force) as log:
         _write_preamble(log, options, world)
         writer = _StepWriter(log, options, generators)
-        for step in interrupts.released_while_iterating(chain([first], steps)):
+        for step in chain([first], interrupts.released_while_iterating(steps)):  # what is left has a scan
             writer.write(START + round(count * period * NS_PER_S), step)
             count += 1
     skipped = options.stops[0] * options.stops[1] - count if options.motion == "warp" else 0

@@ -418,7 +418,8 @@ def data_description(folder: Path, mapper: str) -> str:
         The text of a YAML file.
     """
     names = "".join(f"  {k}: {kind.value}\n" for k, kind in enumerate(KINDS))
-    return f"path: {folder.resolve()}\ntrain: images/{mapper}/train\nval: images/{mapper}/val\nnames:\n{names}"
+    path = strict_json.dumps(str(folder.resolve()))  # quoted as YAML has it
+    return f"path: {path}\ntrain: images/{mapper}/train\nval: images/{mapper}/val\nnames:\n{names}"
 
 
 def write_data_yaml(folder: Path, mapper: str) -> None:

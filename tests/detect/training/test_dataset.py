@@ -13,6 +13,7 @@ import pytest
 from detect.training.crops import collect_crops
 from detect.training.dataset import (
     DatasetOptions,
+    data_description,
     image_style,
     load_samples,
     make_dataset,
@@ -49,6 +50,14 @@ def test_a_data_set_holds_images_labels_and_primitives(small: Path) -> None:
     assert [sample.primitives for sample in load_samples(small, "det", "train")] == [
         sample.primitives for sample in load_samples(small, "forward", "train")
     ]
+
+
+@pytest.mark.parametrize("name", ["set", "my set: #2", "gr\u00fc\u00df"])
+def test_the_description_of_a_data_set_is_yaml_whatever_its_folder_is_called(tmp_path: Path, name: str) -> None:
+    yaml = pytest.importorskip("ruamel.yaml", reason="comes with rosbags")
+    found = yaml.YAML(typ="safe").load(data_description(tmp_path / name, "det"))
+    assert found["path"] == str((tmp_path / name).resolve())
+    assert found["train"] == "images/det/train"
 
 
 def test_an_image_is_read_as_it_was_written(small: Path, tmp_path: Path) -> None:
