@@ -40,7 +40,8 @@ def run(app: typer.Typer, name: str, arguments: Sequence[str]) -> int:
     debug = "--debug" in arguments
     gc.set_threshold(100_000, 50, 50)  # imports make many objects that stay: collecting among them takes 0.4 s
     _prepare_streams()
-    with warnings.catch_warnings(), _without_ignored_interruptions(), Interrupts() as interrupts:
+    interrupts = Interrupts()
+    with warnings.catch_warnings(), _without_ignored_interruptions(interrupts), interrupts:
         if not sys.warnoptions:
             warnings.simplefilter("ignore")  # numpy's quote lines of source code; what matters is a note or an error
         try:
@@ -83,10 +84,18 @@ def _run(app: typer.Typer, name: str, arguments: Sequence[str], interrupts: Inte
 
 
 @contextmanager
-def _without_ignored_interruptions() -> Iterator[None]:
-    """Print nothing of an interruption that came where Python is called from C and drops it: it is raised again."""
+def _without_ignored_interruptions(interrupts: Interrupts) -> Iterator[None]:
+    """Print nothing of an interruption that came where Python is called from C and drops it: it is raised again.
+
+    Nor of what follows from one, as when an object is deleted that was half made.
+    """
     before = sys.unraisablehook
-    sys.unraisablehook = lambda found: None if issubclass(found.exc_type, KeyboardInterrupt) else before(found)
+
+    def report(found: sys.UnraisableHookArgs) -> None:
+        if interrupts.exit_code is None and not issubclass(found.exc_type, KeyboardInterrupt):
+            before(found)
+
+    sys.unraisablehook = report
     try:
         yield
     finally:
