@@ -1,4 +1,5 @@
 import os
+import signal
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -10,6 +11,9 @@ from prim.scan import Scan
 from recorder.sensors import Lidar
 from recorder.session import Session, SessionOptions, record_session
 from recorder.world import WorldOptions
+
+if signal.getsignal(signal.SIGINT) == signal.SIG_IGN:  # as a shell starts what runs in the background
+    signal.signal(signal.SIGINT, signal.default_int_handler)
 
 settings.register_profile("prim", deadline=None)
 settings.load_profile("prim")

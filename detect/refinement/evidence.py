@@ -34,6 +34,7 @@ from detect.refinement.rays import RayBundle
 from detect.refinement.sensor_model import BeamModel
 from prim import linear_algebra
 from prim.arrays import FloatArray
+from prim.se2 import MAX_COORDINATE
 from prim.shapes import Kind, Primitive
 
 EXACT = 1e-9
@@ -158,7 +159,7 @@ def importance_sample(
         points = mean + standard @ lower.T
         cost = split.costs(points @ jacobian.T)
         log_weight = -cost / sensor.dispersion - log_density + np.log(np.diag(lower)).sum()
-        log_weight[~np.isfinite(log_weight)] = -math.inf
+        log_weight[~(np.isfinite(log_weight) & (np.abs(points) <= MAX_COORDINATE).all(axis=1))] = -math.inf
         if not np.isfinite(log_weight).any():
             return impossible
         weight = np.exp(log_weight - log_weight.max())
@@ -345,7 +346,7 @@ def compare_kinds(
         return None
     rough = {fit.kind: rough[fit.kind] for fit in fits}
     top = max(rough.values())
-    contenders = [fit for fit in fits if rough[fit.kind] > top - options.contender]
+    contenders = [fit for fit in fits if rough[fit.kind] >= top - options.contender]
     sampled = {fit.kind: importance_sample(fit, bundle, sensor, options) for fit in contenders}
     sampled |= _merged_special_cases(fits, sampled, bundle, sensor, options)
     for kind, posterior in sampled.items():

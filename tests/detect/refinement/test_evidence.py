@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from detect.refinement.evidence import (
@@ -94,6 +94,8 @@ ODD = [0.0, 1.0, -1.0, 1e6, 1e20, 1e300, -1e300, math.nan, math.inf]
     st.lists(st.sampled_from(ODD), min_size=25, max_size=25),
     st.sampled_from([0.0, 634.0, math.nan, math.inf, -math.inf, 1e300]),
 )
+@example(Kind.SQUARE, [0.0] * 25, 1e300)
+@example(Kind.SQUARE, [0.0, 0.0, 1e20, 0.0, 0.0, 0.0, -1.0, *[0.0] * 4, 1.0, *[0.0] * 13], 0.0)
 def test_degenerate_fits_have_a_finite_posterior_or_none(kind: Kind, entries: list[float], cost: float) -> None:
     """Whatever the information is: singular, indefinite, not finite."""
     size = JACOBIANS[kind].shape[1]
