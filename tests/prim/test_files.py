@@ -32,6 +32,14 @@ def test_two_files_in_the_making_never_share_a_name(tmp_path: Path) -> None:
     assert list(tmp_path.iterdir()) == [tmp_path / "a"]
 
 
+def test_a_name_that_another_process_has_taken_is_left_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    tokens = iter(["00000000", "11111111"])
+    monkeypatch.setattr("prim.files.secrets.token_hex", lambda _: next(tokens))
+    (tmp_path / "a.00000000.part").write_bytes(b"theirs")
+    assert OutputFile(tmp_path / "a", LETTER).part.name == "a.11111111.part"
+    assert (tmp_path / "a.00000000.part").read_bytes() == b"theirs"
+
+
 @pytest.mark.parametrize("content", [b"", b"Dear friend"])
 def test_earlier_results_and_empty_files_are_replaced(tmp_path: Path, content: bytes) -> None:
     (tmp_path / "a").write_bytes(content)
