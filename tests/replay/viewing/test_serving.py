@@ -1,5 +1,6 @@
 """Where a served replay listens, and that it ends with the command."""
 
+import http.client
 import signal
 import subprocess
 import sys
@@ -13,6 +14,7 @@ from prim.errors import UsageError
 from recorder.session import Session
 from replay.viewing.checks import find_free_ports, local_address
 from replay.viewing.protocol import ViewerOptions
+from replay.viewing.serving import RecordingServer
 
 ROOT = Path(__file__).parents[3]
 
@@ -37,8 +39,24 @@ def listening(port: int) -> set[str]:
     return found
 
 
+def test_the_page_alone_may_ask_for_the_recording() -> None:
+    """A browser lets a page of another site read only what the server allows it to (CORS)."""
+    server = RecordingServer("127.0.0.1")
+    page = f"http://127.0.0.1:{server.addresses.web_port}"
+    for origin, allowed in ((page, page), ("http://another.example", None)):
+        connection = http.client.HTTPConnection("127.0.0.1", server.addresses.grpc_port, timeout=10)
+        headers = {"Origin": origin, "Access-Control-Request-Method": "POST"}
+        connection.request("OPTIONS", "/", headers=headers)
+        assert connection.getresponse().headers["access-control-allow-origin"] == allowed
+        connection.close()
+    server.close()
+
+
 @pytest.mark.skipif(sys.platform != "linux", reason="reads the kernel's table of sockets")
-def test_a_replay_is_served_on_loopback_until_it_is_interrupted(tmp_path: Path, noisy_session: Session) -> None:
+@pytest.mark.parametrize(("number", "exit_code"), [(signal.SIGINT, 0), (signal.SIGKILL, -9)])
+def test_a_replay_is_served_on_loopback_until_it_ends(
+    tmp_path: Path, noisy_session: Session, number: int, exit_code: int
+) -> None:
     code = f"import sys; sys.path.insert(0, {str(ROOT)!r}); from replay.__main__ import main; main()"
     ports = find_free_ports((9876, 9090), "127.0.0.1")
     command = [sys.executable, "-c", code, str(noisy_session.path), "--serve", "--no-detect"]
@@ -51,9 +69,9 @@ def test_a_replay_is_served_on_loopback_until_it_is_interrupted(tmp_path: Path, 
     assert [listening(port) for port in ports] == [{"0100007F"}] * 2
     with urllib.request.urlopen(f"http://127.0.0.1:{ports[1]}/", timeout=10) as page:
         assert b"rerun" in page.read().lower()
-    process.send_signal(signal.SIGINT)
+    process.send_signal(number)
     process.communicate(timeout=20)
-    assert process.returncode == 0
+    assert process.returncode == exit_code
     for _ in range(100):
         if not any(listening(port) for port in ports):
             break
