@@ -34,3 +34,22 @@ def test_an_interruption_that_python_drops_is_raised_again_and_its_consequences_
 ) -> None:
     assert console.run(app, "prim", []) == 130
     assert capsys.readouterr() == ("", "prim: error: interrupted\n")
+
+
+@pytest.mark.parametrize(
+    ("error", "line"),
+    [
+        (OSError(24, "Too many open files", "a.mcap"), "a.mcap: Too many open files (--debug shows the traceback)"),
+        (MemoryError(), "out of memory: a larger --resolution or a part of the log takes less"),
+        (KeyError("x"), "unexpected KeyError: 'x' (this is a bug: --debug shows the traceback)"),
+    ],
+)
+def test_what_the_system_refuses_is_no_bug(capsys: pytest.CaptureFixture[str], error: Exception, line: str) -> None:
+    failing = typer.Typer()
+
+    @failing.command()
+    def fail() -> None:
+        raise error
+
+    assert console.run(failing, "prim", []) == 1
+    assert capsys.readouterr().err.startswith(f"prim: error: {line}")
