@@ -336,6 +336,8 @@ def test_odd_surroundings_are_no_bugs(tmp_path: Path, noisy_session: Session) ->
         assert "bug" not in found.stderr
         assert "\x1b" not in found.stdout + found.stderr
         assert len([path for path in tmp_path.iterdir() if path.suffix != ".mcap"]) == 5
+        (report,) = tmp_path.glob("*.json")
+        assert json.loads(report.read_text())["log"]["path"].isprintable()
     reading, writing = os.pipe()
     os.close(reading)  # as of «| head», when it has read enough
     found = subprocess.run(
