@@ -71,6 +71,15 @@ def test_a_viewer_that_goes_away_is_an_error_and_costs_the_file_nothing(
     assert list(tmp_path.iterdir()) == [path]
 
 
+def test_texts_of_a_log_are_shown_without_control_characters(tmp_path: Path, noisy_session: Session) -> None:
+    viewer = RerunViewer(ViewerOptions(save=tmp_path / "a.rrd"), announce=print)
+    result = Pipeline(noisy_session.path, ReplayOptions(selection=Selection(n_scans=2)), viewer).run()
+    viewer.event(1, 0, "topic /a\x1b[2J\udcfc\nand another line")
+    viewer.finish([result])
+    shown = [text for row in rows_of(tmp_path / "a.rrd")["/events"] for text in value(row, "text")]
+    assert "topic /a\\x1b[2J\\udcfc and another line" in shown
+
+
 def test_the_recording_has_exactly_two_timelines(recording: tuple[Path, ReplayResult]) -> None:
     path, result = recording
     scans = timed(rows_of(path)["/map/scan"])
