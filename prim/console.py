@@ -6,6 +6,7 @@ import gc
 import io
 import os
 import sys
+import threading
 import traceback
 import warnings
 from collections.abc import Callable, Iterator, Sequence
@@ -87,19 +88,23 @@ def _run(app: typer.Typer, name: str, arguments: Sequence[str], interrupts: Inte
 def _without_ignored_interruptions(interrupts: Interrupts) -> Iterator[None]:
     """Print nothing of an interruption that came where Python is called from C and drops it: it is raised again.
 
-    Nor of what follows from one, as when an object is deleted that was half made.
+    Nor of what follows from one, as when an object is deleted that was half made, or a thread loses its workers.
     """
-    before = sys.unraisablehook
+    before, before_of_threads = sys.unraisablehook, threading.excepthook
 
     def report(found: sys.UnraisableHookArgs) -> None:
         if interrupts.exit_code is None and not issubclass(found.exc_type, KeyboardInterrupt):
             before(found)
 
-    sys.unraisablehook = report
+    def report_of_thread(found: threading.ExceptHookArgs) -> None:
+        if interrupts.exit_code is None:
+            before_of_threads(found)
+
+    sys.unraisablehook, threading.excepthook = report, report_of_thread
     try:
         yield
     finally:
-        sys.unraisablehook = before
+        sys.unraisablehook, threading.excepthook = before, before_of_threads
 
 
 def exit_process(code: int) -> NoReturn:

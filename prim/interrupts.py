@@ -48,6 +48,7 @@ class Interrupts:
         self.exit_code: int | None = None
         self._is_held = False
         self._pending = False
+        self._process = os.getpid()
         self._previous: dict[signal.Signals, Any] = {}
 
     def __enter__(self) -> Interrupts:
@@ -68,6 +69,8 @@ class Interrupts:
 
     def _receive(self, number: int, frame: FrameType | None) -> None:
         """Raise an interruption, or remember it where the first one is held back."""
+        if os.getpid() != self._process:  # a worker that was just forked
+            os._exit(128 + number)
         self.exit_code = 128 + number
         if self._is_held and not self._pending:
             self._pending = True

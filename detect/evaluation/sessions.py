@@ -10,7 +10,6 @@ rejected in the end.
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import asdict, dataclass
 from functools import lru_cache, partial
 from pathlib import Path
@@ -42,8 +41,8 @@ from detect.training.dataset import (
 )
 from detect.training.matches import LabelledImage, ScoredBoxes
 from prim.arrays import FloatArray
+from prim.processes import process_pool
 from prim.shapes import Kind, Primitive
-from prim.threads import cores
 
 MIN_PROBABILITY = 0.001
 """Smallest probability that a kind counts with: the score floor of YOLOv5's validation."""
@@ -142,7 +141,7 @@ def evaluate_sessions(
         Results as they are stored: ``networks`` (alone) and ``refined``, each as :func:`summarize_sessions`.
     """
     evaluate = partial(evaluate_session, options=options, mapper=mapper, weights=weights)
-    with ProcessPoolExecutor(jobs or cores()) as pool:
+    with process_pool(jobs) as pool:
         scores = list(pool.map(evaluate, seeds))
     networks, refined = zip(*scores, strict=True)
     return {"networks": summarize_sessions(networks), "refined": summarize_sessions(refined)}

@@ -18,7 +18,7 @@ from __future__ import annotations
 import re
 import tempfile
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures import as_completed
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -38,10 +38,10 @@ from prim.errors import OutputError, UsageError
 from prim.files import ResultFormat, write_file
 from prim.log import open_log
 from prim.log.messages import POSE_TYPE, SCAN_TOPIC, TRUE_POSE_TOPIC, decode_poses, decode_scan, planar_pose
+from prim.processes import process_pool
 from prim.scan import Scan
 from prim.se2 import Pose2D, Trajectory
 from prim.shapes import Kind, Primitive
-from prim.threads import cores
 from prim.world import Bounds, World
 from recorder.sensors import Lidar
 from recorder.session import SessionOptions, record_session
@@ -183,11 +183,10 @@ def make_dataset(
     """
     _prepare_folder(folder, options)
     missing = [job for job in session_seeds(options) if not _done(folder, *job).exists()]
-    with ProcessPoolExecutor(workers or cores()) as pool:
+    with process_pool(workers) as pool:
         futures = [pool.submit(_make_session, folder, options, split, seed) for split, seed in missing]
         for count, future in enumerate(as_completed(futures), start=1):
             if failed := future.result():
-                pool.shutdown(cancel_futures=True)
                 raise OutputError(*failed)
             if progress:
                 progress(count, len(missing))

@@ -8,9 +8,7 @@ the kinds, but not the appearance of maps.
 from __future__ import annotations
 
 import math
-import os
 from collections.abc import Iterator
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -34,6 +32,7 @@ from mapping.grid import UNKNOWN_GREY, GridFrame
 from prim import strict_json
 from prim.errors import OutputError, UsageError
 from prim.files import output_errors, write_file
+from prim.processes import process_pool
 from prim.shapes import Kind, Primitive
 
 DRAWINGS = "drawings"
@@ -109,10 +108,9 @@ def make_drawings(folder: Path, options: DrawingOptions, progress: Progress | No
                 (folder / kind / DRAWINGS / split).mkdir(parents=True, exist_ok=True)
     write_file(path, manifest.encode(), OF_THE_SET)
     missing = [job for job in _drawing_seeds(options) if not _image_path(folder, *job).exists()]
-    with ProcessPoolExecutor(len(os.sched_getaffinity(0))) as pool:
+    with process_pool() as pool:
         for done, failed in enumerate(pool.map(partial(_make_drawing, folder), missing, chunksize=50), start=1):
             if failed:
-                pool.shutdown(cancel_futures=True)
                 raise OutputError(*failed)
             if progress:
                 progress(done, len(missing))
