@@ -216,7 +216,7 @@ def yolo(
 ) -> int:
     """Train YOLOv5u to detect primitives.
 
-    An interrupted run is continued.
+    An interrupted run is continued with --trust: its checkpoint is a pickle.
     """
     require_training_extra()
     from detect.training.train import YOLO_PRESETS, train_yolo
@@ -285,7 +285,7 @@ def train_everything(
     """Train weights like those that come with prim.
 
     Trains from scratch and writes FOLDER/weights/MAPPER. Takes hours and reports the duration of each part; an
-    interrupted run is continued.
+    interrupted run is continued, with --trust where it holds checkpoints of YOLO, which are pickles.
     """
     require_training_extra()
     from detect.training.recipe import check_trusted, train_all
@@ -349,7 +349,8 @@ def _evaluate(
     """Evaluate the detector; the default suite takes hours.
 
     Missing sets are made, and an interrupted run is continued. paper: reproduces Tables I and II, with networks
-    trained as in the paper, beside the paper's numbers; writes paper.md, paper.csv, paper.png. shipped: evaluates
+    trained as in the paper, beside the paper's numbers; needs the extra [train], and --trust to continue a run;
+    writes paper.md, paper.csv, paper.png. shipped: evaluates
     weights, without and with refinement, on fresh sessions (selected by --sessions, --mapper and --recorded; the
     report shows all existing results); writes shipped.md, shipped.csv.
     """

@@ -61,7 +61,7 @@ def check_output(path: Path, result: ResultFormat, force: bool = False) -> bool:
     with output_errors(path):
         place = Path(os.path.realpath(path))
         if not place.parent.is_dir():
-            raise FileNotFoundError(errno.ENOENT, os.strerror(errno.ENOENT))
+            raise FileNotFoundError(errno.ENOENT, f"there is no folder {path.parent}")
         if not os.access(place.parent, os.W_OK):
             raise PermissionError(errno.EACCES, os.strerror(errno.EACCES))
         try:
@@ -110,7 +110,7 @@ def check_distinct(outputs: Sequence[Path]) -> None:
     places = [os.path.realpath(path) for path in outputs]
     for path, place in zip(outputs, places, strict=True):
         if places.count(place) > 1:
-            raise UsageError(f"{path} would be written twice: name the outputs, or replay the logs one by one")
+            raise UsageError(f"{path} would be written twice: replay the logs one by one, each with names of its own")
 
 
 def _files_of(path: Path) -> Iterator[Path]:

@@ -17,7 +17,7 @@ Item = TypeVar("Item")
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
 """What interrupts a command: Ctrl-C, and what ``kill``, containers and job queues send."""
 
-HELD_BACK = b"interrupted: what was made so far is kept; Ctrl-C again ends at once\n"
+HELD_BACK = b"interrupted: finishing what was begun; Ctrl-C again ends at once\n"
 
 
 class Interruption(KeyboardInterrupt):
@@ -74,7 +74,8 @@ class Interrupts:
         self.exit_code = 128 + number
         if self._is_held and not self._pending:
             self._pending = True
-            os.write(2, HELD_BACK)  # a signal can come while something is printed: print() may not be called again
+            line = b"\n" + HELD_BACK if os.isatty(2) else HELD_BACK  # below ^C, or a progress bar
+            os.write(2, line)  # a signal can come while something is printed: print() may not be called again
             return
         self._pending = True  # until it is handled: what calls Python from C drops exceptions
         raise Interruption(number)

@@ -77,8 +77,8 @@ class Result:
         grid: The map: ``grid.probability`` (rows, cols), 0.5 where unknown, row 0 at the smallest y; ``grid.frame``
             says where it lies.
         poses: Where the laser was.
-        truth: The true primitives at the end; empty where the log has no truth.
-        errors: How the primitives compare with the truth (``f1``, ``position`` in m …); None where the log has none.
+        truth: The true primitives at the end; empty where the log has no truth, or nothing was detected.
+        errors: How the primitives compare with the truth (``f1``, ``position`` in m …); None without ``truth``.
         scores: How the map compares with the truth; None where the log has none.
         notes: What a user should know.
         report: The report, as ``prim-replay`` writes it (schema ``prim-replay/1``).

@@ -140,7 +140,12 @@ def replay(
     connect: Annotated[
         str | None, typer.Option(metavar="URL", help="Show the replay in a viewer that runs at URL.")
     ] = None,
-    serve: Annotated[bool, typer.Option("--serve", help="Serve the replay to web browsers on this machine.")] = False,
+    serve: Annotated[
+        bool,
+        typer.Option(
+            "--serve", help="Serve the replay to web browsers on this machine, at port 9090 or the next that is free."
+        ),
+    ] = False,
     serve_host: Annotated[
         str | None,
         typer.Option(
@@ -169,7 +174,7 @@ def replay(
         bool, typer.Option("--force", help="Replace files that are no earlier results of prim-replay.")
     ] = False,
     recover: Annotated[bool, typer.Option("--recover", help="Read what is intact of a damaged log.")] = False,
-    quiet: Annotated[bool, typer.Option("--quiet", help="Print errors only.")] = False,
+    quiet: Annotated[bool, typer.Option("--quiet", help="Print errors only, and the addresses of --serve.")] = False,
     verbose: Annotated[
         bool, typer.Option("--verbose", help="Report stage timings, and rejected candidates with the reasons.")
     ] = False,
@@ -392,7 +397,9 @@ def _replay_log(log: Path, outputs: OutputFiles, run: Run) -> int:
     interruption = results[0].interrupted
     if interruption is not None and replaced and not outputs.force:
         viewer.abandon()
-        raise interrupted_run(interruption, "earlier results stay as they are (--force replaces them)")
+        names = ", ".join(map(str, replaced))
+        what = f"nothing is written, since earlier results stay as they are ({names}); --force replaces them"
+        raise interrupted_run(interruption, what)
     with run.interrupts.held():
         written, errors = _write_outputs(results, viewer, outputs)
         if not run.verbosity.quiet:
@@ -402,7 +409,7 @@ def _replay_log(log: Path, outputs: OutputFiles, run: Run) -> int:
         if errors:
             raise errors[0]
     if interruption is not None:
-        raise interrupted_run(interruption, "the results are those of the scans until then")
+        raise interrupted_run(interruption, "what was made until then is written")
     if run.viewer is not None and run.viewer.serve:
         _keep_serving()
     return PARTLY_LOST if results[0].lost else 0

@@ -206,16 +206,18 @@ class Pipeline:
         scans, total = posed_scans.scan_log, self._timer.total()
         lost = [f"lost: {lost}" for lost in log.lost]
         notes = [*lost, *self._notes, *posed_scans.notes()]
+        done = None
         if self._interrupted is not None:
             done = min(branch.usage.scans for branch in branches)
-            notes.append(f"interrupted after {done} of {len(scans)} scans: the results are those until then")
+            what = "the results are" if done < len(scans) else "the primitives are"
+            notes.append(f"interrupted after {done} of {len(scans)} scans: {what} those until then")
         outcomes = [branch.outcome() for branch in branches]
         in_branches = sum(sum(branch.seconds.values()) for branch in branches)
         return tuple(
             ReplayResult(
                 path=self.path,
                 options=branch.options,
-                duration=scans.duration,
+                duration=scans.duration(done),
                 scans=scans.total,
                 scans_used=branch.usage.scans,
                 rays=branch.usage.rays,

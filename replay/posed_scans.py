@@ -87,10 +87,10 @@ class ScanLog:
         """The time (s) from a scan's first beam to its last by the first scan's time_increment."""
         return self.first.time_increment * (len(self.first.ranges) - 1)
 
-    @property
-    def duration(self) -> float:
-        """The time from the earliest selected scan to the latest (s)."""
-        return float(self.stamps.max() - self.stamps.min()) / 1e9
+    def duration(self, count: int | None = None) -> float:
+        """Return the time from the earliest to the latest (s) of the first ``count`` selected scans; None: of all."""
+        stamps = self.stamps[:count]
+        return float(stamps.max() - stamps.min()) / 1e9 if len(stamps) else 0.0
 
     def __len__(self) -> int:
         return len(self._indices)

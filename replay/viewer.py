@@ -275,7 +275,8 @@ class RerunViewer:
             self._output = OutputFile(options.save, RECORDING, options.force)
             sinks.append(rr.FileSink(self._output.part))
         if options.spawn:
-            rr.spawn(connect=False)
+            with environment(CI="true"):  # else it sends usage data, and keeps an identity in the user's settings
+                rr.spawn(connect=False)
             sinks.append(rr.GrpcSink())
         if options.connect is not None:
             sinks.append(rr.GrpcSink(options.connect))

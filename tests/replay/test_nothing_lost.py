@@ -60,6 +60,7 @@ def test_an_interrupted_replay_keeps_what_was_made(
     report = json.loads((tmp_path / "noisy.prob.report.json").read_text())
     assert report["interrupted"] is True
     assert 0 < report["log"]["scans_used"] < report["log"]["scans"]
+    assert report["log"]["duration_s"] == pytest.approx((report["log"]["scans_used"] - 1) / 10)
     assert is_whole(tmp_path / "noisy.prob.rrd")
     names = {"m.pgm", "m.yaml", "noisy.prob.report.json", "noisy.prob.rrd"}
     assert {path.name for path in tmp_path.iterdir()} == names
