@@ -129,10 +129,15 @@ def test_what_is_no_regular_file_is_refused(tmp_path: Path) -> None:
     with suppress(PermissionError):  # only root may make one
         os.mknod(tmp_path / "null", stat.S_IFCHR | 0o666, os.makedev(1, 3))
     before = {path: path.stat().st_mode for path in tmp_path.iterdir()}
-    for path in (*before, tmp_path, tmp_path / "no" / "folder"):
+    for path in (*before, tmp_path):
         with pytest.raises(OutputError, match="cannot write"):
             write_file(path, b"Dear reader", LETTER, force=True)
     assert {path: path.stat().st_mode for path in tmp_path.iterdir()} == before
+
+
+def test_a_missing_folder_is_named_as_such(tmp_path: Path) -> None:
+    with pytest.raises(OutputError, match=r"a: cannot write: No such file or directory; choose another place"):
+        write_file(tmp_path / "no" / "a", b"Dear reader", LETTER)
 
 
 def test_a_link_stays_a_link(tmp_path: Path) -> None:

@@ -74,6 +74,9 @@ def test_an_interrupted_replay_leaves_earlier_results(tmp_path: Path, noisy_sess
     assert exit_code == 130
     assert "earlier results stay as they are" in error
     assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == before
+    exit_code, error = interrupted(tmp_path, noisy_session.path, signal.SIGINT, "--force")
+    assert exit_code == 130, error
+    assert json.loads((tmp_path / "noisy.prob.report.json").read_text())["interrupted"] is True
 
 
 @pytest.mark.parametrize("races", [1, pytest.param(20, marks=pytest.mark.slow)])
@@ -336,6 +339,8 @@ def test_odd_surroundings_are_no_bugs(tmp_path: Path, noisy_session: Session) ->
         assert "bug" not in found.stderr
         assert "\x1b" not in found.stdout + found.stderr
         assert len([path for path in tmp_path.iterdir() if path.suffix != ".mcap"]) == 5
+        report = json.loads(next(tmp_path.glob("*.json")).read_text())
+        assert report["log"]["path"].isprintable()
     reading, writing = os.pipe()
     os.close(reading)  # as of «| head», when it has read enough
     found = subprocess.run(

@@ -1,6 +1,7 @@
 """Where a served replay listens, and that it ends with the command."""
 
 import http.client
+import os
 import signal
 import subprocess
 import sys
@@ -12,6 +13,9 @@ import pytest
 
 from prim.errors import UsageError
 from recorder.session import Session
+from replay.options import ReplayOptions
+from replay.pipeline import Pipeline
+from replay.viewer import RerunViewer
 from replay.viewing.checks import find_free_ports, local_address
 from replay.viewing.protocol import ViewerOptions
 from replay.viewing.serving import RecordingServer
@@ -39,6 +43,12 @@ def listening(port: int) -> set[str]:
     return found
 
 
+def with_home(home: Path) -> dict[str, str]:
+    """An environment in which rerun reports its usage and logs nothing, unless it is told otherwise."""
+    kept = {name: value for name, value in os.environ.items() if name != "CI" and not name.startswith("XDG_")}
+    return kept | {"HOME": str(home), "FORCE_RERUN_ANALYTICS": "1", "RUST_LOG": "off"}
+
+
 def test_the_page_alone_may_ask_for_the_recording() -> None:
     """A browser lets a page of another site read only what the server allows it to (CORS)."""
     server = RecordingServer("127.0.0.1")
@@ -53,6 +63,20 @@ def test_the_page_alone_may_ask_for_the_recording() -> None:
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="reads the kernel's table of sockets")
+def test_a_replay_that_fails_is_served_no_longer(noisy_session: Session) -> None:
+    lines: list[str] = []
+
+    def fail(done: int, total: int) -> None:
+        raise ZeroDivisionError
+
+    viewer = RerunViewer(ViewerOptions(serve=True), lines.append)
+    with pytest.raises(ZeroDivisionError):
+        Pipeline(noisy_session.path, ReplayOptions(detect=False), viewer, fail).run()
+    port = int(lines[0].partition("browse: http://127.0.0.1:")[2].partition("/")[0])
+    assert listening(port) == set()
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="reads the kernel's table of sockets")
 @pytest.mark.parametrize(("number", "exit_code"), [(signal.SIGINT, 0), (signal.SIGKILL, -9)])
 def test_a_replay_is_served_on_loopback_until_it_ends(
     tmp_path: Path, noisy_session: Session, number: int, exit_code: int
@@ -60,7 +84,16 @@ def test_a_replay_is_served_on_loopback_until_it_ends(
     code = f"import sys; sys.path.insert(0, {str(ROOT)!r}); from replay.__main__ import main; main()"
     ports = find_free_ports((9876, 9090), "127.0.0.1")
     command = [sys.executable, "-c", code, str(noisy_session.path), "--serve", "--no-detect"]
-    process = subprocess.Popen(command, cwd=tmp_path, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True)
+    home = tmp_path / "home"
+    home.mkdir()
+    process = subprocess.Popen(
+        command,
+        cwd=tmp_path,
+        env=with_home(home),
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
     assert process.stderr is not None
     lines: list[str] = []
     while not any("still served" in line for line in lines) and (line := process.stderr.readline()):
@@ -77,3 +110,4 @@ def test_a_replay_is_served_on_loopback_until_it_ends(
             break
         time.sleep(0.1)
     assert [listening(port) for port in ports] == [set()] * 2
+    assert not list(home.iterdir())  # where rerun keeps the id of a user whose usage it reports
