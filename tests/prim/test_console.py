@@ -1,10 +1,13 @@
 import os
 import signal
+from collections.abc import Callable
+from contextlib import suppress
 
 import pytest
 import typer
 
 from prim import console
+from prim.errors import UsageError
 
 app = typer.Typer()
 
@@ -33,6 +36,33 @@ def test_an_interruption_that_python_drops_is_raised_again_and_its_consequences_
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     assert console.run(app, "prim", []) == 130
+    assert capsys.readouterr() == ("", "prim: error: interrupted\n")
+
+
+def fail_to_load() -> None:
+    """As an extension does that is interrupted while it is loaded."""
+    with suppress(KeyboardInterrupt):
+        os.kill(os.getpid(), signal.SIGTERM)
+    raise ImportError
+
+
+class InterruptedMessageError(UsageError):
+    def __str__(self) -> str:
+        os.kill(os.getpid(), signal.SIGTERM)
+        return "an interruption while an error is printed"
+
+
+def fail_when_it_is_printed() -> None:
+    raise InterruptedMessageError
+
+
+@pytest.mark.parametrize("command", [fail_to_load, fail_when_it_is_printed])
+def test_what_becomes_of_an_interruption_is_one(
+    capsys: pytest.CaptureFixture[str], command: Callable[[], None]
+) -> None:
+    failing = typer.Typer()
+    failing.command()(command)
+    assert console.run(failing, "prim", []) == 143
     assert capsys.readouterr() == ("", "prim: error: interrupted\n")
 
 

@@ -3,6 +3,7 @@
 import http.client
 import os
 import signal
+import socket
 import subprocess
 import sys
 import time
@@ -16,9 +17,10 @@ from recorder.session import Session
 from replay.options import ReplayOptions
 from replay.pipeline import Pipeline
 from replay.viewer import RerunViewer
+from replay.viewing import serving
 from replay.viewing.checks import find_free_ports, local_address
 from replay.viewing.protocol import ViewerOptions
-from replay.viewing.serving import RecordingServer
+from replay.viewing.serving import END_WITH_PARENT, RecordingServer, ServedAddresses, ServingError
 
 ROOT = Path(__file__).parents[3]
 
@@ -28,6 +30,8 @@ def test_only_addresses_of_this_machine_are_served() -> None:
     for host in ("198.51.100.7", "", "no such host"):
         with pytest.raises(UsageError, match="--serve-host"):
             local_address(host)
+    with pytest.raises(UsageError, match="--serve-host"):
+        RerunViewer(ViewerOptions(serve=True, serve_host="198.51.100.7"), print)
     with pytest.raises(UsageError, match="--serve-host goes with --serve"):
         ViewerOptions(serve_host="127.0.0.1")
 
@@ -50,16 +54,65 @@ def with_home(home: Path) -> dict[str, str]:
 
 
 def test_the_page_alone_may_ask_for_the_recording() -> None:
-    """A browser lets a page of another site read only what the server allows it to (CORS)."""
-    server = RecordingServer("127.0.0.1")
-    page = f"http://127.0.0.1:{server.addresses.web_port}"
+    """A browser lets a page of another site read only what the server allows it to (CORS).
+
+    Pages of 127.0.0.1 it always allows, whoever serves them.
+    """
+    server = RecordingServer("127.0.0.2")
+    page = f"http://127.0.0.2:{server.addresses.web_port}"
     for origin, allowed in ((page, page), ("http://another.example", None)):
-        connection = http.client.HTTPConnection("127.0.0.1", server.addresses.grpc_port, timeout=10)
+        connection = http.client.HTTPConnection("127.0.0.2", server.addresses.grpc_port, timeout=10)
         headers = {"Origin": origin, "Access-Control-Request-Method": "POST"}
         connection.request("OPTIONS", "/", headers=headers)
         assert connection.getresponse().headers["access-control-allow-origin"] == allowed
         connection.close()
     server.close()
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="as Linux does it")
+def test_no_server_starts_for_a_process_that_has_ended() -> None:
+    command = [sys.executable, "-c", END_WITH_PARENT, "0", sys.executable, "-c", "print('started')"]
+    assert subprocess.run(command, capture_output=True, check=True).stdout == b""
+
+
+def test_why_a_server_does_not_start_is_told_in_plain_text(monkeypatch: pytest.MonkeyPatch) -> None:
+    code = r"print('2026-11-27T15:00:00.0Z ERROR re_grpc: \x1b[31mno\x07 place\x1b[0m')"
+    monkeypatch.setattr(serving, "_command", lambda addresses: [sys.executable, "-c", code])
+    with pytest.raises(ServingError, match=r"rerun's server did not start: no place$"):
+        RecordingServer("127.0.0.1")
+
+
+def test_ports_that_another_program_is_faster_to_take_are_left_to_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    command, others = serving._command, []
+
+    def take_port(addresses: ServedAddresses) -> list[str]:
+        if not others:
+            others.append(socket.create_server((addresses.address, addresses.grpc_port)))
+        return command(addresses)
+
+    monkeypatch.setattr(serving, "_command", take_port)
+    server = RecordingServer("127.0.0.1")
+    assert server.addresses.grpc_port != others[0].getsockname()[1]
+    server.close()
+    others[0].close()
+
+
+def test_the_server_is_not_interrupted_by_a_terminal() -> None:
+    """Ctrl-C reaches all processes of a group, and what is left of the recording is still to be sent."""
+    code = """\
+import os, signal, socket, sys, time
+sys.path.insert(0, sys.argv[1])
+from replay.viewing.serving import RecordingServer
+server = RecordingServer("127.0.0.1")
+signal.signal(signal.SIGINT, lambda number, frame: None)
+os.killpg(0, signal.SIGINT)
+time.sleep(1.0)
+socket.create_connection(("127.0.0.1", server.addresses.grpc_port), timeout=5)
+"""
+    found = subprocess.run(
+        [sys.executable, "-c", code, str(ROOT)], start_new_session=True, capture_output=True, text=True, timeout=60
+    )
+    assert found.returncode == 0, found.stderr
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="reads the kernel's table of sockets")
