@@ -345,14 +345,13 @@ def test_a_pipe_is_no_log(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("unbuffered", ["", "1"])
-@pytest.mark.parametrize("arguments", [["--help"], ["a.mcap", "--stops", "3", "3"]])
-def test_a_reader_that_has_gone_is_no_error(tmp_path: Path, arguments: list[str], unbuffered: str) -> None:
+def test_a_reader_that_has_gone_is_no_error(tmp_path: Path, unbuffered: str) -> None:
     """As of «| head», when it has read enough."""
     reading, writing = os.pipe()
     os.close(reading)
     environment = os.environ | {"PYTHONUNBUFFERED": unbuffered}
     found = subprocess.run(
-        command("recorder", *arguments), cwd=tmp_path, env=environment, stdout=writing, stderr=subprocess.PIPE
+        command("recorder", "a.mcap"), cwd=tmp_path, env=environment, stdout=writing, stderr=subprocess.PIPE
     )
     os.close(writing)
     assert (found.returncode, found.stderr) == (0, b"")
