@@ -1,5 +1,6 @@
 import os
 import signal
+import warnings
 from collections.abc import Callable
 from contextlib import suppress
 
@@ -64,6 +65,29 @@ def test_what_becomes_of_an_interruption_is_one(
     failing.command()(command)
     assert console.run(failing, "prim", []) == 143
     assert capsys.readouterr() == ("", "prim: error: interrupted\n")
+
+
+def test_warnings_are_not_printed(capsys: pytest.CaptureFixture[str]) -> None:
+    warning = typer.Typer()
+
+    @warning.command()
+    def warn() -> None:
+        warnings.warn("overflow encountered in multiply", RuntimeWarning, stacklevel=1)
+
+    assert console.run(warning, "prim", []) == 0
+    assert capsys.readouterr() == ("", "")
+
+
+def test_tracebacks_hold_nothing_that_a_terminal_obeys(capsys: pytest.CaptureFixture[str]) -> None:
+    failing = typer.Typer()
+
+    @failing.command()
+    def fail(debug: bool = False) -> None:
+        raise UsageError("\x1b[2J")
+
+    assert console.run(failing, "prim", ["--debug"]) == 2
+    err = capsys.readouterr().err
+    assert r"prim.errors.UsageError: \x1b[2J" in err and "\x1b" not in err
 
 
 @pytest.mark.parametrize(
