@@ -30,9 +30,11 @@ from detect.training.train import YoloOptions, train_yolo
 if __name__ == "__main__":
     train_yolo(Path("set"), "det", Path("out"), YoloOptions(epochs=1, batch=4, mosaic=False, turn=False))
     import ultralytics
+    from ultralytics.utils import AUTOINSTALL
     from ultralytics.utils.callbacks import platform
 
-    assert not platform.callbacks and not any(value is True for value in ultralytics.settings.values())
+    assert not AUTOINSTALL and not platform.callbacks
+    assert not any(value is True for value in ultralytics.settings.values())
 """
 
 
