@@ -98,15 +98,27 @@ class RunsCode:
         return exec, ("open('ran', 'w').close()",)
 
 
-@pytest.mark.parametrize("command", ["yolo", "all"])
-def test_an_interrupted_run_must_be_trusted_to_go_on(run: Run, command: str) -> None:
+@pytest.mark.parametrize(
+    ("app", "arguments"),
+    [
+        ("train", ["yolo", "set", "out/yolo", "--mapper", "det"]),
+        ("train", ["all", "out"]),
+        ("evaluation", ["out"]),
+    ],
+)
+def test_an_interrupted_run_must_be_trusted_to_go_on(
+    run: Run, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], app: str, arguments: list[str]
+) -> None:
     """Its checkpoint is a pickle: nothing in it may run."""
     pytest.importorskip("torch", reason="needs the extra [train]")
+    monkeypatch.setattr("detect.training.recipe.train_all", None)  # which would take hours
+    monkeypatch.setattr("detect.evaluation.suites.PaperSuite", None)
     run("dataset", "set", "--maps", 1, 1, "--mapper", "det")
-    last = Path("out") / "weights" / "last.pt"
+    last = Path("out") / "yolo" / "weights" / "last.pt"
     last.parent.mkdir(parents=True)
     last.write_bytes(pickle.dumps(RunsCode()))
-    code, _, err = run("yolo", "set", "out", "--mapper", "det") if command == "yolo" else run("all", "out")
+    code = console.run(getattr(cli, app), "prim", arguments)
+    err = capsys.readouterr().err
     assert code == 2 and "last.pt is a pickle" in err and "--trust" in err and err.count("\n") == 1
     assert not Path("ran").exists()
 

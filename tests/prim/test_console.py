@@ -1,10 +1,14 @@
 import os
 import signal
+import warnings
+from collections.abc import Callable
+from contextlib import suppress
 
 import pytest
 import typer
 
 from prim import console
+from prim.errors import UsageError
 
 app = typer.Typer()
 
@@ -34,6 +38,59 @@ def test_an_interruption_that_python_drops_is_raised_again_and_its_consequences_
 ) -> None:
     assert console.run(app, "prim", []) == 130
     assert capsys.readouterr() == ("", "prim: error: interrupted\n")
+
+
+def fail_to_load() -> None:
+    """As an extension does that is interrupted while it is loaded."""
+    with suppress(KeyboardInterrupt):
+        os.kill(os.getpid(), signal.SIGINT)
+    raise ImportError
+
+
+class InterruptedMessageError(UsageError):
+    def __str__(self) -> str:
+        os.kill(os.getpid(), signal.SIGINT)
+        return "an interruption while an error is printed"
+
+
+def fail_when_it_is_printed() -> None:
+    raise InterruptedMessageError
+
+
+@pytest.mark.parametrize("command", [fail_to_load, fail_when_it_is_printed])
+def test_what_becomes_of_an_interruption_is_one(
+    capsys: pytest.CaptureFixture[str], command: Callable[[], None]
+) -> None:
+    failing = typer.Typer()
+    failing.command()(command)
+    try:
+        assert console.run(failing, "prim", []) == 130
+    except KeyboardInterrupt:
+        pytest.fail("it was raised")
+    assert capsys.readouterr() == ("", "prim: error: interrupted\n")
+
+
+def test_warnings_are_not_printed(capsys: pytest.CaptureFixture[str]) -> None:
+    warning = typer.Typer()
+
+    @warning.command()
+    def warn() -> None:
+        warnings.warn("overflow encountered in multiply", RuntimeWarning, stacklevel=1)
+
+    assert console.run(warning, "prim", []) == 0
+    assert capsys.readouterr() == ("", "")
+
+
+def test_tracebacks_hold_nothing_that_a_terminal_obeys(capsys: pytest.CaptureFixture[str]) -> None:
+    failing = typer.Typer()
+
+    @failing.command()
+    def fail(debug: bool = False) -> None:
+        raise UsageError("\x1b[2J")
+
+    assert console.run(failing, "prim", ["--debug"]) == 2
+    err = capsys.readouterr().err
+    assert r"prim.errors.UsageError: \x1b[2J" in err and "\x1b" not in err
 
 
 @pytest.mark.parametrize(

@@ -1,14 +1,25 @@
 import os
 import re
 import resource
+import stat
 import subprocess
 import sys
+from contextlib import suppress
 from pathlib import Path
 
 import pytest
 
 from prim.errors import OutputError, UsageError
-from prim.files import OutputFile, ResultFormat, check_distinct, check_no_input, check_output, write_file, write_files
+from prim.files import (
+    MARKED_BYTES,
+    OutputFile,
+    ResultFormat,
+    check_distinct,
+    check_no_input,
+    check_output,
+    write_file,
+    write_files,
+)
 
 LETTER = ResultFormat("a letter", re.compile(rb"Dear "))
 
@@ -20,6 +31,20 @@ def test_a_file_is_in_its_place_only_when_it_is_complete(tmp_path: Path) -> None
     file.commit()
     assert (tmp_path / "a").read_bytes() == b"Dear reader"
     assert list(tmp_path.iterdir()) == [tmp_path / "a"]
+
+
+def test_a_file_is_synced_before_it_is_renamed_and_its_folder_afterwards(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Else a loss of power leaves an empty file in the place of a good one."""
+    synced: list[tuple[int, bool]] = []
+
+    def sync(descriptor: int) -> None:
+        synced.append((os.fstat(descriptor).st_ino, (tmp_path / "a").exists()))
+
+    monkeypatch.setattr("prim.files.os.fsync", sync)
+    write_file(tmp_path / "a", b"Dear reader", LETTER)
+    assert synced == [((tmp_path / "a").stat().st_ino, False), (tmp_path.stat().st_ino, True)]
 
 
 def test_two_files_in_the_making_never_share_a_name(tmp_path: Path) -> None:
@@ -48,6 +73,16 @@ def test_earlier_results_and_empty_files_are_replaced(tmp_path: Path, content: b
     write_file(tmp_path / "a", b"Dear reader", LETTER)
     assert (tmp_path / "a").read_bytes() == b"Dear reader"
     assert (tmp_path / "a").stat().st_mode & 0o777 == 0o640
+
+
+@pytest.mark.parametrize("size", [0, 2 * MARKED_BYTES])
+def test_a_result_is_recognised_by_its_end(tmp_path: Path, size: int) -> None:
+    signed = ResultFormat("a signed letter", re.compile(rb"Yours, prim"), at_end=True)
+    (tmp_path / "a").write_bytes(b"Dear reader" + bytes(size) + b"Yours, prim\n")
+    assert check_output(tmp_path / "a", signed)
+    (tmp_path / "a").write_bytes(b"Yours, prim" + bytes(2 * MARKED_BYTES))
+    with pytest.raises(UsageError, match="is not a signed letter"):
+        check_output(tmp_path / "a", signed)
 
 
 def test_of_files_that_belong_together_all_are_replaced_or_none(tmp_path: Path) -> None:
@@ -80,12 +115,29 @@ def test_a_file_that_appears_meanwhile_stays_and_so_does_what_was_written(tmp_pa
     assert file.part.read_bytes() == b"Dear reader"
 
 
+def test_a_file_that_cannot_be_put_in_its_place_is_removed(tmp_path: Path) -> None:
+    file = OutputFile(tmp_path / "a", LETTER)
+    (tmp_path / "a").mkdir()
+    with pytest.raises(OutputError, match="a: cannot write"):
+        file.commit()
+    assert list(tmp_path.iterdir()) == [tmp_path / "a"]
+
+
 def test_what_is_no_regular_file_is_refused(tmp_path: Path) -> None:
+    """A device of the test's own: as root, code that fails here would replace the machine's."""
     os.mkfifo(tmp_path / "pipe")
-    for path in (Path("/dev/null"), tmp_path / "pipe", tmp_path, tmp_path / "no" / "folder"):
+    with suppress(PermissionError):  # only root may make one
+        os.mknod(tmp_path / "null", stat.S_IFCHR | 0o666, os.makedev(1, 3))
+    before = {path: path.stat().st_mode for path in tmp_path.iterdir()}
+    for path in (*before, tmp_path):
         with pytest.raises(OutputError, match="cannot write"):
             write_file(path, b"Dear reader", LETTER, force=True)
-    assert Path("/dev/null").is_char_device()
+    assert {path: path.stat().st_mode for path in tmp_path.iterdir()} == before
+
+
+def test_a_missing_folder_is_named_as_such(tmp_path: Path) -> None:
+    with pytest.raises(OutputError, match=r"a: cannot write: there is no folder \S*no; choose another place"):
+        write_file(tmp_path / "no" / "a", b"Dear reader", LETTER)
 
 
 def test_a_link_stays_a_link(tmp_path: Path) -> None:
@@ -98,11 +150,12 @@ def test_a_link_stays_a_link(tmp_path: Path) -> None:
 def test_an_input_is_known_under_all_of_its_names(tmp_path: Path) -> None:
     bag = tmp_path / "bag"
     bag.mkdir()
-    for name in ("metadata.yaml", "bag_0.mcap", "bag.prob.report.json"):
+    inputs = ("metadata.yaml", "bag_0.mcap", "bag_1.mcap.zstd", "bag_0.db3", "bag_1.db3.zstd", "yolo.onnx")
+    for name in (*inputs, "bag.prob.report.json"):
         (bag / name).touch()
     os.link(bag / "bag_0.mcap", tmp_path / "hard")
     (tmp_path / "soft").symlink_to(bag / "bag_0.mcap")
-    for path in (bag / "metadata.yaml", bag / "bag_0.mcap", tmp_path / "hard", tmp_path / "soft"):
+    for path in (*(bag / name for name in inputs), tmp_path / "hard", tmp_path / "soft"):
         with pytest.raises(UsageError, match="the input"):
             check_no_input([bag], [path])
     check_no_input([bag], [bag / "bag.prob.report.json", tmp_path / "new"])

@@ -1,10 +1,11 @@
 import os
 import signal
 from collections.abc import Iterator
+from contextlib import suppress
 
 import pytest
 
-from prim.interrupts import Interruption, Interrupts
+from prim.interrupts import SIGNALS, Interruption, Interrupts, end_when_interrupted
 
 
 def interrupt(number: int = signal.SIGINT) -> None:
@@ -25,12 +26,31 @@ def test_the_handlers_are_restored() -> None:
     assert [signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)] == before
 
 
-def test_an_interruption_is_held_back_until_the_end() -> None:
+@pytest.fixture
+def ignored() -> Iterator[None]:
+    """Let the process ignore the signals, as nohup and shells do for a background job."""
+    before = {number: signal.signal(number, signal.SIG_IGN) for number in SIGNALS}
+    yield
+    for number, handler in before.items():
+        signal.signal(number, handler)
+
+
+@pytest.mark.usefixtures("ignored")
+def test_signals_that_are_ignored_stay_so() -> None:
+    end_when_interrupted("prim")
+    with suppress(Interruption), Interrupts() as interrupts:
+        for number in SIGNALS:
+            interrupt(number)
+    assert interrupts.exit_code is None
+
+
+def test_an_interruption_is_held_back_until_the_end_and_a_line_says_so(capfd: pytest.CaptureFixture[str]) -> None:
     done = []
     with Interrupts() as interrupts, pytest.raises(Interruption), interrupts.held():
         interrupt()
         done.append("all")
     assert done == ["all"]
+    assert capfd.readouterr().err == "interrupted: finishing what was begun; Ctrl-C again ends at once\n"
 
 
 def test_a_second_interruption_ends_at_once() -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -43,6 +44,35 @@ def test_regular_matrices_are_solved() -> None:
     assert solution is not None and inverse is not None
     assert matrix @ solution == pytest.approx(right) and inverse @ right == pytest.approx(solution)
     assert linear_algebra.log_determinant(matrix) == pytest.approx(np.log(1.75))
+    assert linear_algebra.log_determinant(np.diag([-1.0, 2.0])) is None
+
+
+FUNCTIONS = (
+    linear_algebra.inverse,
+    linear_algebra.cholesky,
+    linear_algebra.eigenvalues,
+    linear_algebra.principal_axes,
+    linear_algebra.log_determinant,
+)
+
+
+@pytest.mark.parametrize("function", FUNCTIONS)
+def test_what_is_not_finite_has_no_result_even_where_it_is_not_read(function: Callable[[FloatArray], object]) -> None:
+    """Those of symmetric matrices read one half of them."""
+    matrix = np.eye(3)
+    assert function(matrix) is not None
+    for row, col in ((0, 2), (2, 0)):
+        odd = matrix.copy()
+        odd[row, col] = np.nan
+        assert function(odd) is None
+
+
+def test_what_does_not_converge_has_no_result(monkeypatch: pytest.MonkeyPatch) -> None:
+    def fail(matrix: FloatArray) -> None:
+        raise np.linalg.LinAlgError("Eigenvalues did not converge")
+
+    monkeypatch.setattr(np.linalg, "eigh", fail)
+    assert linear_algebra.principal_axes(np.eye(2)) is None
 
 
 @pytest.mark.parametrize("points", [[[1.0, 2.0]], [[1.0, 1.0], [1.0, 1.0]], [[np.nan, 0.0], [1.0, 2.0]]])

@@ -20,7 +20,7 @@ from prim.processes import process_pool
 app = typer.Typer()
 
 def work(number):
-    print(os.getpid(), flush=True)
+    os.write(1, f"{os.getpid()}\\n".encode())
     time.sleep(60)
 
 @app.command()

@@ -77,6 +77,14 @@ def test_absurd_worlds_are_refused_in_one_short_line(tmp_path: Path, text: str) 
     assert "\n" not in str(error.value) and len(str(error.value)) < 400
 
 
+def test_messages_quote_any_value_in_short() -> None:
+    deep: list[Any] = []
+    for _ in range(100_000):
+        deep = [deep]
+    assert strict_json.shown(deep) == strict_json.shown(10**5000) == "a value that cannot be shown"
+    assert strict_json.shown({"a": [1, None]}) == '{"a": [1, null]}'
+
+
 @pytest.mark.parametrize("value", [1e300, math.nan, math.inf, 10**400])
 def test_primitives_have_plausible_values(value: float) -> None:
     with pytest.raises(UsageError, match=r"beyond 1e\+09|not finite"):

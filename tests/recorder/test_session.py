@@ -1,5 +1,7 @@
 import json
 import math
+import os
+import signal
 from dataclasses import replace
 from pathlib import Path
 
@@ -12,6 +14,7 @@ from prim import console
 from prim.errors import UsageError, WorldError
 from prim.log import open_log
 from prim.log.messages import (
+    GPS_TOPIC,
     POSE_TYPE,
     SCAN_TOPIC,
     TRUE_POSE_TOPIC,
@@ -19,9 +22,11 @@ from prim.log.messages import (
     decode_scan,
     planar_pose,
 )
+from prim.scan import Scan
 from prim.se2 import Pose2D
 from prim.shapes import Kind, Primitive
 from prim.world import World
+from recorder import session
 from recorder.cli import app
 from recorder.sensors import Compass, Gps, Lidar
 from recorder.session import Session, SessionOptions, record_session
@@ -34,6 +39,26 @@ ROBOT_RADIUS = SimulatorOptions().robot_radius
 
 def prim_record(*arguments: object) -> int:
     return console.run(app, "prim-record", [str(argument) for argument in arguments])
+
+
+def test_an_interrupted_recording_ends_with_a_whole_step(
+    in_tmp: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    encode, scans = session.encode_scan, []
+
+    def interrupted_encode(scan: Scan) -> bytes:
+        scans.append(scan)
+        if len(scans) == 3:
+            os.kill(os.getpid(), signal.SIGTERM)
+        return encode(scan)
+
+    monkeypatch.setattr(session, "encode_scan", interrupted_encode)
+    assert prim_record("a.mcap", "--stops", 4, 4) == 143
+    (part,) = in_tmp.resolve().iterdir()
+    line = f"prim-record: error: interrupted: what was recorded until then is in {part}\n"
+    assert capsys.readouterr().err == line
+    with open_log(part) as log:
+        assert {log.topics[topic].messages for topic in (SCAN_TOPIC, GPS_TOPIC, TRUE_POSE_TOPIC)} == {3}
 
 
 def test_the_same_options_write_the_same_bytes(tmp_path: Path) -> None:

@@ -2,6 +2,8 @@
 
 import json
 import math
+import os
+import signal
 import subprocess
 import sys
 from collections.abc import Callable
@@ -17,6 +19,7 @@ from prim import console
 from recorder.sensors import Lidar
 from recorder.session import Session, SessionOptions, record_session
 from replay.cli import app, join_bounds
+from replay.outputs import exports
 
 Run = Callable[..., tuple[int, str, str]]
 
@@ -252,6 +255,22 @@ def test_a_replay_that_fails_keeps_the_earlier_recording(replay: Run, noisy_sess
     assert replay("bad.mcap", "--save", "a.rrd")[0] == 1
     assert Path("a.rrd").read_bytes() == earlier
     assert {path.name for path in Path().iterdir()} == {"a.rrd", "bad.mcap"}
+
+
+def test_an_interruption_while_outputs_are_written_waits_for_all_of_them(
+    replay: Run, noisy_session: Session, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    write = exports.write_report
+
+    def interrupted_write(*arguments: Any) -> None:
+        os.kill(os.getpid(), signal.SIGTERM)
+        write(*arguments)
+
+    monkeypatch.setattr(exports, "write_report", interrupted_write)
+    options = ("--no-detect", "--no-viewer", "--map", "m", "--trajectory", "t.tum", "--n-scans", 3)
+    code, _, err = replay(noisy_session.path, *options)
+    assert (code, err) == (143, "prim-replay: error: interrupted\n")
+    assert {path.name for path in Path().iterdir()} == {"noisy.prob.report.json", "m.pgm", "m.yaml", "t.tum"}
 
 
 def test_max_range_leaves_fewer_occupied_cells(replay: Run, noisy_session: Session) -> None:

@@ -75,6 +75,9 @@ def test_an_interrupted_replay_leaves_earlier_results(tmp_path: Path, noisy_sess
     assert exit_code == 130
     assert "earlier results stay as they are" in error
     assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == before
+    exit_code, error = interrupted(tmp_path, noisy_session.path, signal.SIGINT, "--force")
+    assert exit_code == 130, error
+    assert json.loads((tmp_path / "noisy.prob.report.json").read_text())["interrupted"] is True
 
 
 @pytest.mark.parametrize("races", [1, pytest.param(20, marks=pytest.mark.slow)])
@@ -208,8 +211,19 @@ def test_a_recorder_on_a_full_disk_leaves_the_earlier_log(tmp_path: Path) -> Non
     assert {path: path.read_bytes() for path in tmp_path.iterdir()} == {tmp_path / "a.mcap": before}
 
 
-@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
-def test_an_interruption_while_a_command_is_loaded_is_one_line(tmp_path: Path, number: int, code: int) -> None:
+@pytest.mark.parametrize(
+    ("name", "part", "entry", "number", "code"),
+    [
+        ("prim-replay", "replay", "main", signal.SIGINT, 130),
+        ("prim-replay", "replay", "main", signal.SIGTERM, 143),
+        ("prim-record", "recorder", "main", signal.SIGTERM, 143),
+        ("prim-train", "detect", "main", signal.SIGTERM, 143),
+        ("prim-eval", "detect", "main_eval", signal.SIGTERM, 143),
+    ],
+)
+def test_an_interruption_while_a_command_is_loaded_is_one_line(
+    tmp_path: Path, name: str, part: str, entry: str, number: int, code: int
+) -> None:
     """It comes before there is a command that could handle it."""
     interrupt = f"""\
 import os
@@ -218,9 +232,11 @@ class Finder:
         if name == "typer":
             os.kill(os.getpid(), {int(number)})
 sys.meta_path.insert(0, Finder())
+from {part}.__main__ import {entry} as main
+main()
 """
-    found = run(tmp_path, "replay", "a.mcap", before=interrupt)
-    assert (found.returncode, found.stderr) == (code, "prim-replay: error: interrupted\n")
+    found = run(tmp_path, part, before=interrupt)
+    assert (found.returncode, found.stderr) == (code, f"{name}: error: interrupted\n")
 
 
 def test_an_interrupted_process_waits_for_no_thread(tmp_path: Path) -> None:
@@ -232,7 +248,10 @@ threading.Thread(target=threading.Event().wait).start()
 print("some output", end="")
 exit_process(130)
 """
-    found = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, timeout=60)
+    buffered = {name: value for name, value in os.environ.items() if name != "PYTHONUNBUFFERED"}
+    found = subprocess.run(
+        [sys.executable, "-c", code], cwd=ROOT, env=buffered, capture_output=True, text=True, timeout=60
+    )
     assert (found.returncode, found.stdout, found.stderr) == (130, "some output", "")
 
 
@@ -326,6 +345,19 @@ def test_a_pipe_is_no_log(tmp_path: Path) -> None:
         assert "cannot be read back and forth" in found.stderr
 
 
+@pytest.mark.parametrize("unbuffered", ["", "1"])
+def test_a_reader_that_has_gone_is_no_error(tmp_path: Path, unbuffered: str) -> None:
+    """As of «| head», when it has read enough."""
+    reading, writing = os.pipe()
+    os.close(reading)
+    environment = os.environ | {"PYTHONUNBUFFERED": unbuffered}
+    found = subprocess.run(
+        command("recorder", "a.mcap"), cwd=tmp_path, env=environment, stdout=writing, stderr=subprocess.PIPE
+    )
+    os.close(writing)
+    assert (found.returncode, found.stderr) == (0, b"")
+
+
 def test_odd_surroundings_are_no_bugs(tmp_path: Path, noisy_session: Session) -> None:
     """Names that are no UTF-8, stdout that is ASCII, closed or full, a working folder that is gone."""
     log = tmp_path / "gr\udcfc\u00df\x1b[2J.mcap"
@@ -339,13 +371,6 @@ def test_odd_surroundings_are_no_bugs(tmp_path: Path, noisy_session: Session) ->
         assert len([path for path in tmp_path.iterdir() if path.suffix != ".mcap"]) == 5
         (report,) = tmp_path.glob("*.json")
         assert json.loads(report.read_text())["log"]["path"].isprintable()
-    reading, writing = os.pipe()
-    os.close(reading)  # as of «| head», when it has read enough
-    found = subprocess.run(
-        command("replay", log, "--no-viewer"), cwd=tmp_path, stdout=writing, stderr=subprocess.PIPE
-    )
-    os.close(writing)
-    assert (found.returncode, found.stderr) == (0, b"")
     gone = tmp_path / "gone"
     gone.mkdir()
     found = run(gone, "replay", log, before="import os; os.rmdir(os.getcwd())\n")

@@ -2,6 +2,7 @@
 
 import json
 import math
+import sys
 from collections.abc import Callable, Iterable
 from dataclasses import replace
 from pathlib import Path
@@ -53,8 +54,9 @@ Replay = Callable[..., tuple[int, str, dict[str, Any]]]
 
 
 @pytest.fixture
-def replay(in_tmp: Path, capsys: pytest.CaptureFixture[str]) -> Replay:
-    """Exit code, stderr, report."""
+def replay(in_tmp: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> Replay:
+    """Exit code, stderr, report; warnings, which a command would not show, are errors."""
+    monkeypatch.setattr(sys, "warnoptions", ["error"])
 
     def run(*arguments: object) -> tuple[int, str, dict[str, Any]]:
         arguments = ("--no-viewer", "--mapper", "det", "--report", "r.json", *arguments)

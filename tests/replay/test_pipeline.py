@@ -1,6 +1,8 @@
 """The pipeline as a library: lasers mounted upside down, truth that moves, repeatable results."""
 
 import json
+import os
+import signal
 import time
 from dataclasses import replace
 from pathlib import Path
@@ -8,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from prim.interrupts import Interruption, Interrupts
 from prim.log.messages import (
     MARKERS_TYPE,
     POSE_TYPE,
@@ -18,6 +21,7 @@ from prim.log.messages import (
     encode_scan,
 )
 from prim.log.writer import LogWriter
+from prim.scan import PosedScan
 from prim.se2 import Pose2D
 from prim.shapes import Kind, Primitive
 from prim.world import World
@@ -26,7 +30,9 @@ from recorder.session import Session
 from replay.options import ReplayOptions
 from replay.pipeline import Pipeline
 from replay.result import ReplayResult
+from replay.selection import Selection
 from replay.timing import StageTimer
+from replay.viewing.protocol import NullViewer
 from tests.replay.poses.test_pose_provider import raw_transform
 
 STAMP = 5 * 10**9
@@ -106,3 +112,35 @@ def test_time_of_a_nested_stage_counts_towards_the_inner_one() -> None:
             time.sleep(0.02)
     assert timer.seconds["read"] >= 0.04 and timer.seconds["refine"] < timer.seconds["read"] / 2
     assert sum(timer.seconds.values()) <= timer.total()
+
+
+class InterruptedViewer(NullViewer):
+    """Interrupts the process when the fifth scan is shown."""
+
+    def show_scan(self, posed: PosedScan) -> None:
+        if posed.position == 4:
+            os.kill(os.getpid(), signal.SIGINT)
+
+
+def test_an_interrupted_replay_has_mapped_whole_scans(noisy_session: Session) -> None:
+    options = ReplayOptions(mapper="det,prob", detect=False)
+    with Interrupts() as interrupts:
+        results = Pipeline(noisy_session.path, options, InterruptedViewer(), interrupts=interrupts).run_each()
+    assert results[0].scans_used == 5
+    for result in results:
+        selection = Selection(n_scans=result.scans_used)
+        until_then = Pipeline(noisy_session.path, replace(result.options, selection=selection)).run()
+        assert result.interrupted is not None and result.rays == until_then.rays
+
+
+def test_a_replay_that_is_interrupted_before_its_first_scan_has_no_result(
+    noisy_session: Session, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("replay.pipeline.RatePacer.wait", lambda pacer, stamp: os.kill(os.getpid(), signal.SIGINT))
+    with Interrupts() as interrupts, pytest.raises(Interruption):
+        Pipeline(noisy_session.path, ReplayOptions(detect=False), interrupts=interrupts).run()
+
+
+def test_a_replay_without_a_command_raises_what_interrupts_it(noisy_session: Session) -> None:
+    with pytest.raises(KeyboardInterrupt):
+        Pipeline(noisy_session.path, ReplayOptions(detect=False), InterruptedViewer()).run()

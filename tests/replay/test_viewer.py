@@ -71,13 +71,30 @@ def test_a_viewer_that_goes_away_is_an_error_and_costs_the_file_nothing(
     assert list(tmp_path.iterdir()) == [path]
 
 
-def test_texts_of_a_log_are_shown_without_control_characters(tmp_path: Path, noisy_session: Session) -> None:
-    viewer = RerunViewer(ViewerOptions(save=tmp_path / "a.rrd"), announce=print)
-    result = Pipeline(noisy_session.path, ReplayOptions(selection=Selection(n_scans=2)), viewer).run()
-    viewer.event(1, 0, "topic /a\x1b[2J\udcfc\nand another line")
+def test_a_recording_that_rerun_cannot_finish_is_one_line_and_leaves_no_file(
+    tmp_path: Path, noisy_session: Session, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail(stream: rr.RecordingStream, *, timeout_sec: float) -> None:
+        raise RuntimeError("two\nlines\x1b[2J")
+
+    monkeypatch.setattr(rr.RecordingStream, "flush", fail)
+    with pytest.raises(RecordingError, match=r"could not be written in full: two lines\\x1b\[2J$"):
+        replayed(noisy_session.path, tmp_path / "a.rrd", selection=Selection(n_scans=3), detect=False)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_what_a_terminal_obeys_is_not_in_the_recording(tmp_path: Path, noisy_session: Session) -> None:
+    """The viewer's text can be copied to a terminal."""
+    log, path = tmp_path / "a\x1b[2J.mcap", tmp_path / "a.rrd"
+    log.write_bytes(noisy_session.path.read_bytes())
+    viewer = RerunViewer(ViewerOptions(save=path), announce=print)
+    result = Pipeline(log, ReplayOptions(selection=Selection(n_scans=3), detect=False), viewer).run()
+    viewer.event(0, 0, "a topic\x1b[2J")
     viewer.finish([result])
-    shown = [text for row in rows_of(tmp_path / "a.rrd")["/events"] for text in value(row, "text")]
-    assert "topic /a\\x1b[2J\\udcfc and another line" in shown
+    rows = rows_of(path)
+    assert value(rows["/__properties"][-1], "name") == [r"a\x1b[2J.mcap (prob)"]
+    assert value(rows["/events"][-1], "text") == [r"a topic\x1b[2J"]
+    assert r"| **log** | a\x1b[2J.mcap, " in value(rows["/summary"][0], "text")[0]
 
 
 def test_the_recording_has_exactly_two_timelines(recording: tuple[Path, ReplayResult]) -> None:

@@ -5,6 +5,9 @@ from __future__ import annotations
 import csv
 import json
 import math
+import os
+import subprocess
+import sys
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -160,6 +163,25 @@ def test_an_incomplete_report_counts_the_missing_rows(tmp_path: Path) -> None:
     case = next(suites.cases())
     markdown, _, _ = tables.write_paper_report([(case, evaluation_json(0.9), {})], tmp_path)
     assert "25 of 26 rows are not measured yet" in markdown.read_text()
+
+
+def test_a_report_leaves_the_home_alone(tmp_path: Path) -> None:
+    """matplotlib would keep a list of fonts there."""
+    pytest.importorskip("torch", reason="needs the extra [train]")
+    pytest.importorskip("matplotlib", reason="needs the extra [train]")
+    case, home, made = next(suites.cases()), tmp_path / "home", tmp_path / "work" / "results"
+    home.mkdir()
+    made.mkdir(parents=True)
+    (made / f"{case.network}.{case.test_set}.json").write_text(json.dumps(evaluation_json(0.5)))
+    kept = {name: value for name, value in os.environ.items() if not name.startswith(("MPL", "XDG", "YOLO"))}
+    code = "from detect.__main__ import main_eval; main_eval()"
+    subprocess.run(
+        [sys.executable, "-c", code, made.parent, "--so-far"],
+        cwd=Path(__file__).parents[3],
+        env=kept | {"HOME": str(home)},
+        check=True,
+    )
+    assert (made.parent / "report" / "paper.png").exists() and not list(home.iterdir())
 
 
 def test_a_data_set_with_other_options_is_refused(tmp_path: Path) -> None:
