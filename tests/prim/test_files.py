@@ -1,3 +1,4 @@
+import ast
 import os
 import re
 import resource
@@ -20,6 +21,9 @@ from prim.files import (
     write_file,
     write_files,
 )
+
+ROOT = Path(__file__).parents[2]
+WRITING = re.compile(r"\.(write_bytes|write_text|tofile|imwrite)\(|open\([^()]*'[rb]*[wax+]")
 
 LETTER = ResultFormat("a letter", re.compile(rb"Dear "))
 
@@ -176,9 +180,22 @@ def test_a_full_disk_leaves_what_was_there(tmp_path: Path) -> None:
         "except OutputError as error: print(error)"
     )
     assert resource.RLIMIT_FSIZE is not None
-    run = subprocess.run(
-        [sys.executable, "-c", code, tmp_path / "a"], capture_output=True, text=True, cwd=Path(__file__).parents[2]
-    )
+    run = subprocess.run([sys.executable, "-c", code, tmp_path / "a"], capture_output=True, text=True, cwd=ROOT)
     assert "File too large" in run.stdout, run.stderr
     assert (tmp_path / "a").read_bytes() == b"Dear friend"
     assert list(tmp_path.iterdir()) == [tmp_path / "a"]
+
+
+def test_nothing_else_writes_files() -> None:
+    """Else a full disk or an interruption would leave half a file in the place of a good one."""
+    others = set()
+    for part in ("prim", "recorder", "mapping", "detect", "replay"):
+        for path in (ROOT / part).rglob("*.py"):
+            for node in ast.walk(ast.parse(path.read_text("utf-8"))):
+                if isinstance(node, ast.Call) and WRITING.search(ast.unparse(node)):
+                    others.add(path.relative_to(ROOT).as_posix())
+    assert others == {
+        "prim/files.py",
+        "prim/console.py",  # /dev/null in the place of a closed stream
+        "prim/log/writer.py",  # the part of an OutputFile
+    }

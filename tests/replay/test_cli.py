@@ -3,6 +3,7 @@
 import json
 import math
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -13,7 +14,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from detect.networks.weights import shipped_weights
+from detect.networks.weights import SHIPPED, shipped_weights
 from mapping.mapper import MAPPERS
 from prim import console
 from recorder.sensors import Lidar
@@ -234,6 +235,8 @@ def test_an_unreadable_log_does_not_stop_the_others(replay: Run, noisy_session: 
     code, _, err = replay("bad.mcap", noisy_session.path, "--no-viewer")
     assert (code, err.count("\n")) == (1, 1)
     assert Path("noisy.prob.report.json").exists()
+    Path("cut.mcap").write_bytes(noisy_session.path.read_bytes()[:-200])  # of which a part is lost
+    assert replay("cut.mcap", "bad.mcap", "--recover", "--no-viewer", "--no-detect")[0] == 1
 
 
 @pytest.mark.parametrize("option", ["--save", "--report", "--trajectory"])
@@ -243,6 +246,14 @@ def test_no_output_overwrites_a_log(replay: Run, noisy_session: Session, option:
     assert (code, "is the input" in err) == (2, True)
     assert noisy_session.path.read_bytes() == before
     assert replay(noisy_session.path, "--report", "same", option, "same")[0] == (0 if option == "--report" else 2)
+
+
+def test_no_output_overwrites_the_weights(replay: Run, noisy_session: Session) -> None:
+    shutil.copytree(SHIPPED / "prob", "w")
+    before = Path("w/yolo.onnx").read_bytes()
+    code, _, err = replay(noisy_session.path, "--weights", "w", "--report", "w/yolo.onnx", "--force")
+    assert (code, "belongs to the input w:" in err) == (2, True)
+    assert Path("w/yolo.onnx").read_bytes() == before
 
 
 def test_a_replay_that_fails_keeps_the_earlier_recording(replay: Run, noisy_session: Session) -> None:
@@ -271,6 +282,22 @@ def test_an_interruption_while_outputs_are_written_waits_for_all_of_them(
     code, _, err = replay(noisy_session.path, *options)
     assert (code, err) == (143, "prim-replay: error: interrupted\n")
     assert {path.name for path in Path().iterdir()} == {"noisy.prob.report.json", "m.pgm", "m.yaml", "t.tum"}
+
+
+def test_an_interruption_ends_the_replays_of_all_logs(
+    replay: Run, noisy_session: Session, quiet_session: Session, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    stamps = []
+
+    def wait(pacer: object, stamp: int) -> None:
+        stamps.append(stamp)
+        if len(stamps) == 3:
+            os.kill(os.getpid(), signal.SIGINT)
+
+    monkeypatch.setattr("replay.pipeline.RatePacer.wait", wait)
+    code, _, err = replay(noisy_session.path, quiet_session.path, "--no-detect", "--no-viewer")
+    assert code == 130 and "note: interrupted after 2 of" in err
+    assert [path.name for path in Path().iterdir()] == ["noisy.prob.report.json"]
 
 
 def test_max_range_leaves_fewer_occupied_cells(replay: Run, noisy_session: Session) -> None:

@@ -83,6 +83,16 @@ def test_a_recording_that_rerun_cannot_finish_is_one_line_and_leaves_no_file(
     assert list(tmp_path.iterdir()) == []
 
 
+def test_a_replay_that_fails_leaves_no_file(tmp_path: Path, noisy_session: Session) -> None:
+    def fail(done: int, total: int) -> None:
+        raise ZeroDivisionError
+
+    viewer = RerunViewer(ViewerOptions(save=tmp_path / "a.rrd"), announce=print)
+    with pytest.raises(ZeroDivisionError):
+        Pipeline(noisy_session.path, ReplayOptions(detect=False), viewer, fail).run()
+    assert list(tmp_path.iterdir()) == []
+
+
 def test_what_a_terminal_obeys_is_not_in_the_recording(tmp_path: Path, noisy_session: Session) -> None:
     """The viewer's text can be copied to a terminal."""
     log, path = tmp_path / "a\x1b[2J.mcap", tmp_path / "a.rrd"
