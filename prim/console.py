@@ -15,7 +15,7 @@ from typing import NoReturn, TextIO
 
 import typer
 
-from prim.errors import PrimError, UsageError
+from prim.errors import OutputError, PrimError, UsageError
 from prim.interrupts import Interrupts
 from prim.text import printable
 
@@ -157,11 +157,11 @@ def _prepare_streams() -> None:
             stream.reconfigure(errors="backslashreplace")
 
 
-def _ignore_output() -> int:
-    """Drop what is still to be printed: nobody reads it, or it has no place."""
+def _ignore_output(name: str = "stdout") -> int:
+    """Drop what is still to be printed on a stream: nobody reads it, or it has no place."""
     with suppress(OSError):
-        sys.stdout.close()
-    sys.stdout = open(os.devnull, "w", encoding="utf-8")  # noqa: PTH123, SIM115 - to the end of the process
+        getattr(sys, name).close()
+    setattr(sys, name, open(os.devnull, "w", encoding="utf-8"))  # noqa: PTH123, SIM115 - to the end of the process
     return 0
 
 
@@ -176,11 +176,27 @@ def echo(line: str, err: bool = False) -> None:
 
 
 def _print(text: str, stream: TextIO) -> None:
-    """Print text; nothing is said where the reader of stdout has gone."""
-    try:
+    """Print text, see :func:`_printing`."""
+    with _printing(stream):
         print(text, file=stream)
-    except BrokenPipeError:
-        _ignore_output()
+
+
+@contextmanager
+def _printing(stream: TextIO) -> Iterator[None]:
+    """Say nothing where the reader of stdout has gone, nor where stderr has no place for what is printed.
+
+    Raises:
+        OutputError: Stdout has no place for it.
+    """
+    try:
+        yield
+    except OSError as error:
+        if stream is sys.stderr:
+            _ignore_output("stderr")
+        elif isinstance(error, BrokenPipeError):
+            _ignore_output()
+        else:
+            raise OutputError("stdout", error) from error
 
 
 def print_table(rows: Sequence[Sequence[str]], header: Sequence[str] = ()) -> None:
@@ -201,7 +217,7 @@ def print_table(rows: Sequence[Sequence[str]], header: Sequence[str] = ()) -> No
     for row in rows:
         table.add_row(*(Text(printable(cell)) for cell in row))
     console = Console(highlight=False, soft_wrap=True)
-    with console.capture() as captured:
+    with _printing(sys.stdout), console.capture() as captured:
         console.print(table)
     _print(captured.get().rstrip("\n"), sys.stdout)
 

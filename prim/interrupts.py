@@ -6,7 +6,7 @@ import os
 import signal
 import threading
 from collections.abc import Iterable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from types import FrameType, TracebackType
 from typing import Any, TypeVar
 
@@ -75,7 +75,7 @@ class Interrupts:
         if self._is_held and not self._pending:
             self._pending = True
             line = b"\n" + HELD_BACK if os.isatty(2) else HELD_BACK  # below ^C, or a progress bar
-            os.write(2, line)  # a signal can come while something is printed: print() may not be called again
+            _write_error(line)
             return
         self._pending = True  # until it is handled: what calls Python from C drops exceptions
         raise Interruption(number)
@@ -153,9 +153,15 @@ def end_when_interrupted(name: str) -> None:
     """
 
     def end(number: int, frame: FrameType | None) -> None:
-        os.write(2, f"{name}: error: interrupted\n".encode())
+        _write_error(f"{name}: error: interrupted\n".encode())
         os._exit(128 + number)
 
     for number in SIGNALS:
         if signal.getsignal(number) != signal.SIG_IGN:
             signal.signal(number, end)
+
+
+def _write_error(line: bytes) -> None:
+    """Write a line to stderr from a signal's handler, where print() may be running; nobody may read it any more."""
+    with suppress(OSError):
+        os.write(2, line)

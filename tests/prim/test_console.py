@@ -1,8 +1,11 @@
 import os
 import signal
+import subprocess
+import sys
 import warnings
 from collections.abc import Callable
 from contextlib import suppress
+from pathlib import Path
 
 import pytest
 import typer
@@ -110,3 +113,42 @@ def test_what_the_system_refuses_is_no_bug(capsys: pytest.CaptureFixture[str], e
 
     assert console.run(failing, "prim", []) == 1
     assert capsys.readouterr().err.startswith(f"prim: error: {line}")
+
+
+PRINTING = """\
+import sys, typer
+from prim import console
+app = typer.Typer()
+@app.command()
+def command() -> None:
+    console.echo("a note", err=True)
+    console.print_table([("a", "result")])
+    console.echo("more")
+console.exit_process(console.run(app, "prim", sys.argv[1:]))
+"""
+
+
+def printed(**streams: object) -> subprocess.CompletedProcess[str]:
+    """Run a command that prints a note on stderr and results on stdout."""
+    root = Path(__file__).parents[2]
+    return subprocess.run(  # type: ignore[call-overload,no-any-return]
+        [sys.executable, "-c", PRINTING], cwd=root, text=True, **streams
+    )
+
+
+def test_stderr_that_nobody_reads_or_that_is_full_costs_stdout_nothing() -> None:
+    reading, writing = os.pipe()
+    os.close(reading)
+    with os.fdopen(writing, "wb") as gone, Path("/dev/full").open("wb") as full:
+        for stderr in (gone, full):
+            found = printed(stdout=subprocess.PIPE, stderr=stderr)
+            assert (found.returncode, found.stdout) == (0, "a  result\nmore\n")
+
+
+def test_stdout_that_is_full_is_one_line() -> None:
+    with Path("/dev/full").open("wb") as full:
+        found = printed(stdout=full, stderr=subprocess.PIPE)
+    assert found.returncode == 1
+    note, error = found.stderr.splitlines()
+    assert note == "a note"
+    assert "stdout" in error and "No space left on device" in error

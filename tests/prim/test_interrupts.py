@@ -53,6 +53,23 @@ def test_an_interruption_is_held_back_until_the_end_and_a_line_says_so(capfd: py
     assert capfd.readouterr().err == "interrupted: finishing what was begun; Ctrl-C again ends at once\n"
 
 
+def test_an_interruption_is_held_back_where_nobody_reads_stderr() -> None:
+    """As of «2>&1 | head»: the reader is gone, and what is held together may not be torn for that."""
+    reading, writing = os.pipe()
+    os.close(reading)
+    before = os.dup(2)
+    os.dup2(writing, 2)
+    try:
+        with Interrupts() as interrupts, pytest.raises(Interruption), interrupts.held():
+            interrupt()
+            done = True
+    finally:
+        os.dup2(before, 2)
+        for descriptor in (before, writing):
+            os.close(descriptor)
+    assert done
+
+
 def test_a_second_interruption_ends_at_once() -> None:
     with Interrupts() as interrupts, pytest.raises(Interruption), interrupts.held():
         interrupt()
