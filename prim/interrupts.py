@@ -48,11 +48,12 @@ class Interrupts:
         self.exit_code: int | None = None
         self._is_held = False
         self._pending = False
-        self._process = os.getpid()
+        self._process = 0
         self._previous: dict[signal.Signals, Any] = {}
 
     def __enter__(self) -> Interrupts:
         if threading.current_thread() is threading.main_thread():
+            self._process = os.getpid()
             for number in SIGNALS:
                 if signal.getsignal(number) != signal.SIG_IGN:  # as nohup and shells set it for a background job
                     self._previous[number] = signal.signal(number, self._receive)
