@@ -13,10 +13,15 @@ from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
 
+import numpy as np
 import pytest
 
+from mapping.grid import GridFrame, OccupancyGrid
+from prim.errors import UsageError
+from prim.files import ResultFormat
 from prim.log import open_log
 from recorder.session import Session
+from replay.outputs import exports
 
 ROOT = Path(__file__).parents[2]
 
@@ -281,6 +286,32 @@ def test_logs_of_others_and_inputs_are_never_replaced(tmp_path: Path, noisy_sess
     assert (again.returncode, again.stdout.splitlines()[-1]) == (0, "replaced: world.json")
 
 
+@pytest.mark.parametrize(
+    ("result", "content"),
+    [
+        (exports.REPORT, b'{"schema": "another/1"}'),
+        (exports.RECORDING, b"RRF2" + bytes(300)),
+        (exports.MAP_IMAGE, b"P5\n2 1\n255\n\0\0"),
+        (exports.MAP_DESCRIPTION, b"image: m.pgm\nresolution: 0.05\norigin: [0, 0, 0]\nnegate: 0\n"),
+        (exports.TRAJECTORY, b"1.5 0.1 0.2 0 0 0 0 1\n"),
+    ],
+    ids=lambda value: value.name if isinstance(value, ResultFormat) else "",
+)
+def test_files_of_other_programs_are_no_earlier_results(tmp_path: Path, result: ResultFormat, content: bytes) -> None:
+    (tmp_path / "a").write_bytes(content)
+    assert not result.recognizes(tmp_path / "a")
+
+
+def test_a_map_of_another_program_is_replaced_by_force_alone(tmp_path: Path) -> None:
+    grid = OccupancyGrid(GridFrame(0.05, 0, 0, rows=2, cols=1), np.full((2, 1), 0.5, np.float32))
+    (tmp_path / "m.yaml").write_text("image: m.pgm\n")
+    with pytest.raises(UsageError, match="--force"):
+        exports.write_map(tmp_path / "m", grid)
+    assert [path.name for path in tmp_path.iterdir()] == ["m.yaml"]
+    exports.write_map(tmp_path / "m", grid, force=True)
+    assert len(list(tmp_path.iterdir())) == 2
+
+
 def test_earlier_results_are_replaced_and_a_line_says_so(tmp_path: Path, noisy_session: Session) -> None:
     options = [noisy_session.path, "--no-detect", "--map", "m", "--trajectory", "t.tum"]
     assert "replaced" not in run(tmp_path, "replay", *options).stdout
@@ -340,7 +371,7 @@ def test_no_command_asks_for_the_network_or_writes_elsewhere(
 def test_a_pipe_is_no_log(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "pipe")
     for name in ("pipe", "/dev/stdin"):
-        found = run(tmp_path, "replay", name, "--no-viewer", input="")
+        found = run(tmp_path, "replay", name, "--no-viewer", input="", timeout=60)
         assert (found.returncode, found.stderr.count("\n")) == (1, 1)
         assert "cannot be read back and forth" in found.stderr
 
