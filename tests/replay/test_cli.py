@@ -404,6 +404,14 @@ def test_unwritable_outputs_are_refused(replay: Run, noisy_session: Session, opt
     assert "cannot write" in err and err.count("\n") == 1
 
 
+@pytest.mark.parametrize("option", ["--save", "--report", "--map", "--trajectory"])
+@pytest.mark.parametrize("name", ["", ".", "..", "/"])
+def test_outputs_without_a_name_are_refused(replay: Run, noisy_session: Session, option: str, name: str) -> None:
+    code, _, err = replay(noisy_session.path, option, name, "--mapper", "det,prob")
+    assert (code, option in err, err.count("\n")) == (2, True, 1)
+    assert list(Path().iterdir()) == []
+
+
 def test_spawn_without_a_display_is_refused(
     replay: Run, noisy_session: Session, monkeypatch: pytest.MonkeyPatch
 ) -> None:
