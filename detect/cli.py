@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 ALL = "all"
 """Stands for all kinds."""
 
-train = typer.Typer(add_completion=False, rich_markup_mode=None, no_args_is_help=True)
+train = typer.Typer(add_completion=False, rich_markup_mode=None)
 
 
 class ImageSource(StrEnum):

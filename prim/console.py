@@ -130,6 +130,9 @@ def _describe(error: Exception) -> str:
         return f"{where}{error.strerror} (--debug shows the traceback)"
     if isinstance(error, MemoryError):
         return "out of memory: a larger --resolution or a part of the log takes less (--debug shows the traceback)"
+    if isinstance(error, ImportError):
+        what = "damaged, of another version, or larger than the memory that is allowed"
+        return f"a library cannot be loaded, it is {what}: {error} (--debug shows the traceback)"
     return f"unexpected {type(error).__name__}: {error} (this is a bug: --debug shows the traceback)"
 
 

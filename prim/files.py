@@ -15,6 +15,10 @@ from pathlib import Path
 
 from prim.errors import OutputError, UsageError
 
+MAX_NAME_BYTES, KEPT_LETTERS = 255, 60
+"""The longest name that file systems take, and how many letters of a longer one a file in the making keeps: each has
+at most four bytes."""
+
 MARKED_BYTES = 1 << 16
 """A result is recognised by so many bytes of its start or its end."""
 
@@ -135,8 +139,9 @@ def _identity(path: Path) -> tuple[int, int] | None:
 class OutputFile:
     """A file in the making.
 
-    Until it is complete, it lies beside its place under a name that nobody else uses, NAME.XXXXXXXX.part; then it is
-    synced and renamed. A process that is killed leaves that file, and what was in its place before.
+    Until it is complete, it lies beside its place under a name that nobody else uses, NAME.XXXXXXXX.part, where NAME
+    is shortened if it has to be; then it is synced and renamed. A process that is killed leaves that file, and what
+    was in its place before.
 
     Args:
         path: Its place; of a symbolic link, the file that it leads to.
@@ -164,7 +169,9 @@ class OutputFile:
         """Create the file under a name that is free."""
         with output_errors(self.path):
             while True:
-                part = self._place.with_name(f"{self._place.name}.{secrets.token_hex(4)}.part")
+                ending = f".{secrets.token_hex(4)}.part"
+                is_long = len(os.fsencode(self._place.name + ending)) > MAX_NAME_BYTES
+                part = self._place.with_name(self._place.name[: KEPT_LETTERS if is_long else None] + ending)
                 with suppress(FileExistsError):
                     os.close(os.open(part, os.O_WRONLY | os.O_CREAT | os.O_EXCL | getattr(os, "O_BINARY", 0), 0o666))
                     return part

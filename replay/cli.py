@@ -241,6 +241,9 @@ class OutputFiles:
         map: The map, which has two files.
         trajectory: The laser's poses.
         force: Whether files in their places may be replaced that are no earlier results.
+
+    Raises:
+        UsageError: One has a name that only a folder can have.
     """
 
     recording: Path | None
@@ -248,6 +251,16 @@ class OutputFiles:
     map: Path | None
     trajectory: Path | None
     force: bool
+
+    def __post_init__(self) -> None:
+        for option, path in (
+            ("--save", self.recording),
+            ("--report", self.report),
+            ("--map", self.map),
+            ("--trajectory", self.trajectory),
+        ):
+            if path is not None and path.name in ("", ".."):
+                raise UsageError(f"{option} {path}: it names a folder, and not what is to be written there")
 
     def named_after(self, log: Path, mappers: Sequence[str], with_recording: bool) -> OutputFiles:
         """Name the recording and the report, where they have no name yet, after a log, in the current folder.

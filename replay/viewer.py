@@ -15,7 +15,7 @@ from mapping.grid import OccupancyGrid
 from mapping.map_metrics import MapScores
 from prim.arrays import FloatArray
 from prim.environment import environment
-from prim.errors import PrimError
+from prim.errors import PrimError, UsageError
 from prim.files import OutputFile
 from prim.metrics import DetectionErrors
 from prim.scan import PosedScan
@@ -101,7 +101,7 @@ class RerunViewer:
 
     Raises:
         UsageError: A viewer is to be opened, and there is no display; or a URL is not one of a viewer; or a host is
-            none of this machine.
+            none of this machine; or rerun is switched off.
         ViewerUnreachableError: No viewer answers at the URL.
     """
 
@@ -120,6 +120,8 @@ class RerunViewer:
         self._output: OutputFile | None = None
         self._server: RecordingServer | None = None
         self._recording = rr.RecordingStream(APPLICATION)
+        if not rr.is_enabled(self._recording):
+            raise UsageError("rerun is switched off by the environment variable RERUN: unset it, or give --no-viewer")
         self._recording.set_log_time_enabled(False)
         self._batch = ScanBatch(options.live, options.watched)
         self._pose_errors: list[tuple[tuple[int, int], tuple[float, float], tuple[float, float]]] = []
@@ -275,8 +277,8 @@ class RerunViewer:
             self._output = OutputFile(options.save, RECORDING, options.force)
             sinks.append(rr.FileSink(self._output.part))
         if options.spawn:
-            with environment(CI="true"):  # else it sends usage data, and keeps an identity in the user's settings
-                rr.spawn(connect=False)
+            with environment(CI="true", RUST_LOG="off"):  # the viewer sends no usage data and logs nothing then
+                rr.spawn(connect=False, recording=self._recording)
             sinks.append(rr.GrpcSink())
         if options.connect is not None:
             sinks.append(rr.GrpcSink(options.connect))

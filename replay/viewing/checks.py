@@ -41,7 +41,7 @@ def check_viewer(url: str) -> None:
         raise UsageError(f"--connect {url}: give an address such as rerun+http://127.0.0.1:9876/proxy")
     try:
         socket.create_connection((host, port), timeout=CONNECT_SECONDS).close()
-    except OSError as error:
+    except (OSError, ValueError) as error:  # ValueError: no host can have that name
         raise ViewerUnreachableError(f"no viewer answers at {url}: {error}; start one there with: rerun") from error
 
 

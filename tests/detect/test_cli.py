@@ -46,6 +46,7 @@ def test_a_data_set_is_made_and_continued(run: Run) -> None:
         (["dataset", "a", "--mapper", "magic"], "--mapper"),
         (["dataset", "a", "--kind", "magic"], "choose from all, square"),
         (["magic"], "magic"),
+        ([], "Missing command. (try: prim-train --help)"),
     ],
 )
 def test_impossible_options(run: Run, arguments: list[str], said: str) -> None:

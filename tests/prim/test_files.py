@@ -69,6 +69,12 @@ def test_a_name_that_another_process_has_taken_is_left_alone(tmp_path: Path, mon
     assert (tmp_path / "a.00000000.part").read_bytes() == b"theirs"
 
 
+@pytest.mark.parametrize("name", ["a" * 255, "ü" * 127, "\udcff" * 255])
+def test_a_name_may_be_as_long_as_the_system_takes_it(tmp_path: Path, name: str) -> None:
+    write_file(tmp_path / name, b"Dear reader", LETTER)
+    assert list(tmp_path.iterdir()) == [tmp_path / name]
+
+
 @pytest.mark.parametrize("content", [b"", b"Dear friend"])
 def test_earlier_results_and_empty_files_are_replaced(tmp_path: Path, content: bytes) -> None:
     (tmp_path / "a").write_bytes(content)

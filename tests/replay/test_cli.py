@@ -450,6 +450,14 @@ def test_unwritable_outputs_are_refused(replay: Run, noisy_session: Session, opt
     assert "cannot write" in err and err.count("\n") == 1
 
 
+@pytest.mark.parametrize("option", ["--save", "--report", "--map", "--trajectory"])
+@pytest.mark.parametrize("name", ["", ".", "..", "/"])
+def test_outputs_without_a_name_are_refused(replay: Run, noisy_session: Session, option: str, name: str) -> None:
+    code, _, err = replay(noisy_session.path, option, name, "--mapper", "det,prob")
+    assert (code, option in err, err.count("\n")) == (2, True, 1)
+    assert list(Path().iterdir()) == []
+
+
 def test_spawn_without_a_display_is_refused(
     replay: Run, noisy_session: Session, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -459,8 +467,9 @@ def test_spawn_without_a_display_is_refused(
     assert (code, "--save" in err, err.count("\n")) == (2, True, 1)
 
 
-def test_a_viewer_that_does_not_answer_is_reported(replay: Run, noisy_session: Session) -> None:
-    code, _, err = replay(noisy_session.path, "--connect", "rerun+http://127.0.0.1:9/proxy", "--n-scans", 3)
+@pytest.mark.parametrize("host", ["127.0.0.1", pytest.param("a" * 64, id="a name that no host can have")])
+def test_a_viewer_that_does_not_answer_is_reported(replay: Run, noisy_session: Session, host: str) -> None:
+    code, _, err = replay(noisy_session.path, "--connect", f"rerun+http://{host}:9/proxy", "--n-scans", 3)
     assert code == 1
     assert "no viewer answers" in err and err.count("\n") == 1
 

@@ -13,6 +13,7 @@ import pytest
 import rerun as rr
 
 from mapping.grid import OccupancyGrid
+from prim.errors import UsageError
 from prim.log import open_log
 from prim.log.messages import SCAN_TOPIC, decode_scan
 from prim.se2 import Pose2D
@@ -105,6 +106,32 @@ def test_what_a_terminal_obeys_is_not_in_the_recording(tmp_path: Path, noisy_ses
     assert value(rows["/__properties"][-1], "name") == [r"a\x1b[2J.mcap (prob)"]
     assert value(rows["/events"][-1], "text") == [r"a topic\x1b[2J"]
     assert r"| **log** | a\x1b[2J.mcap, " in value(rows["/summary"][0], "text")[0]
+
+
+def test_a_viewer_is_spawned_for_the_recording_and_sends_no_usage_data(
+    tmp_path: Path, noisy_session: Session, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """rerun spawns none for a recording that does not exist, and prints a warning."""
+    spawned = []
+
+    def spawn(connect: bool, recording: rr.RecordingStream | None = None) -> None:
+        spawned.append((connect, rr.is_enabled(recording), os.environ.get("CI")))
+
+    monkeypatch.delenv("CI", raising=False)
+    monkeypatch.setenv("DISPLAY", ":0")
+    monkeypatch.setattr(rr, "spawn", spawn)
+    monkeypatch.setattr(rr, "GrpcSink", lambda: rr.FileSink(tmp_path / "sent.rrd"))
+    viewer = RerunViewer(ViewerOptions(spawn=True), announce=print)
+    viewer.finish([Pipeline(noisy_session.path, ReplayOptions(selection=Selection(n_scans=2)), viewer).run()])
+    assert spawned == [(False, True, "true")]
+    assert "CI" not in os.environ
+    assert len(timed(rows_of(tmp_path / "sent.rrd")["/map/scan"])) == 2
+
+
+def test_rerun_that_is_switched_off_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("RERUN", "off")
+    with pytest.raises(UsageError, match="RERUN"):
+        RerunViewer(ViewerOptions(), announce=print)
 
 
 def test_the_recording_has_exactly_two_timelines(recording: tuple[Path, ReplayResult]) -> None:
