@@ -133,7 +133,7 @@ def test_a_replay_that_fails_is_served_no_longer(noisy_session: Session) -> None
 @pytest.mark.skipif(sys.platform != "linux", reason="reads the kernel's table of sockets")
 @pytest.mark.parametrize(("number", "exit_code"), [(signal.SIGINT, 0), (signal.SIGKILL, -9)])
 def test_a_replay_is_served_on_loopback_until_it_ends(
-    tmp_path: Path, noisy_session: Session, number: int, exit_code: int
+    tmp_path: Path, noisy_session: Session, number: int, exit_code: int, request: pytest.FixtureRequest
 ) -> None:
     code = f"import sys; sys.path.insert(0, {str(ROOT)!r}); from replay.__main__ import main; main()"
     command = [sys.executable, "-c", code, str(noisy_session.path), "--serve", "--no-detect"]
@@ -147,6 +147,7 @@ def test_a_replay_is_served_on_loopback_until_it_ends(
         stderr=subprocess.PIPE,
         text=True,
     )
+    request.addfinalizer(process.kill)  # where a check fails
     assert process.stderr is not None
     lines: list[str] = []
     while not any("still served" in line for line in lines) and (line := process.stderr.readline()):
