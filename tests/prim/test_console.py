@@ -44,7 +44,10 @@ def test_an_interruption_that_python_drops_is_raised_again_and_its_consequences_
     [
         (OSError(24, "Too many open files", "a.mcap"), "a.mcap: Too many open files (--debug shows the traceback)"),
         (MemoryError(), "out of memory: a larger --resolution or a part of the log takes less"),
-        (ImportError("x.so: failed to map segment from shared object"), "a library cannot be loaded, it is damaged, "),
+        (
+            ImportError("x.so: failed to map segment from shared object"),
+            "a library cannot be loaded, it is damaged, ",
+        ),
         (KeyError("x"), "unexpected KeyError: 'x' (this is a bug: --debug shows the traceback)"),
     ],
 )
