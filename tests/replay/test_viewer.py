@@ -13,7 +13,7 @@ import pytest
 import rerun as rr
 
 from mapping.grid import OccupancyGrid
-from prim.errors import UsageError
+from prim.errors import OutputError, UsageError
 from prim.log import open_log
 from prim.log.messages import SCAN_TOPIC, decode_scan
 from prim.se2 import Pose2D
@@ -70,6 +70,16 @@ def test_a_viewer_that_goes_away_is_an_error_and_costs_the_file_nothing(
         viewer.finish([result])
     assert len(timed(rows_of(path)["/map/scan"])) == 10
     assert list(tmp_path.iterdir()) == [path]
+
+
+def test_a_recording_that_somebody_removes_is_an_expected_error(tmp_path: Path, noisy_session: Session) -> None:
+    """Which does not cost the report."""
+    viewer = RerunViewer(ViewerOptions(save=tmp_path / "a.rrd"), announce=print)
+    result = Pipeline(noisy_session.path, ReplayOptions(selection=Selection(n_scans=2)), viewer).run()
+    (part,) = tmp_path.iterdir()
+    part.unlink()
+    with pytest.raises(OutputError, match=r"a\.rrd: cannot write"):
+        viewer.finish([result])
 
 
 def test_a_viewer_is_spawned_for_the_recording_and_sends_no_usage_data(
