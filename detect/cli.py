@@ -97,7 +97,7 @@ def dataset(
     ] = None,
     seed: Annotated[int | None, typer.Option(metavar="N", help="The first session's seed.")] = None,
     workers: Annotated[
-        int | None, typer.Option(metavar="N", help="Worker processes. [default: one per core]")
+        int | None, typer.Option(metavar="N", help="Worker processes. [default: one per core]", min=1)
     ] = None,
     quiet: Annotated[bool, typer.Option("--quiet", help="Print errors only.")] = False,
     debug: Annotated[bool, typer.Option("--debug", help="Show tracebacks.")] = False,

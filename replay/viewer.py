@@ -16,7 +16,7 @@ from mapping.map_metrics import MapScores
 from prim.arrays import FloatArray
 from prim.environment import environment
 from prim.errors import PrimError, UsageError
-from prim.files import OutputFile
+from prim.files import OutputFile, output_errors
 from prim.metrics import DetectionErrors
 from prim.scan import PosedScan
 from prim.text import printable
@@ -427,8 +427,10 @@ def _check_whole(output: OutputFile) -> None:
 
     Raises:
         RecordingError: It does not; it is removed then.
+        OutputError: It is not there any more.
     """
-    content = _end_of(output.part, _FOOTER.size)
+    with output_errors(output.path):
+        content = _end_of(output.part, _FOOTER.size)
     if len(content) == _FOOTER.size and _FOOTER.unpack(content)[3] == _FOOTER_MARK:
         return
     output.discard()

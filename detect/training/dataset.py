@@ -17,7 +17,7 @@ from __future__ import annotations
 
 import re
 import tempfile
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import as_completed
 from dataclasses import asdict, dataclass, replace
 from functools import partial
@@ -35,7 +35,7 @@ from mapping.grid import GridFrame, OccupancyGrid
 from mapping.mapper import MAPPERS, make_mapper
 from prim import strict_json
 from prim.errors import OutputError, UsageError
-from prim.files import ResultFormat, write_file
+from prim.files import ResultFormat, output_errors, write_file
 from prim.log import open_log
 from prim.log.messages import POSE_TYPE, SCAN_TOPIC, TRUE_POSE_TOPIC, decode_poses, decode_scan, planar_pose
 from prim.processes import process_pool
@@ -43,6 +43,7 @@ from prim.scan import Scan
 from prim.se2 import Pose2D, Trajectory
 from prim.shapes import Kind, Primitive
 from prim.world import Bounds, World
+from recorder.keywords import LARGEST
 from recorder.sensors import Lidar
 from recorder.session import SessionOptions, record_session
 from recorder.world import WorldOptions
@@ -106,6 +107,11 @@ class DatasetOptions:
             raise UsageError(f"there is no mapper {unknown[0]!r}: choose from {', '.join(MAPPERS)}")
         if min(self.sizes) < 0 or not sum(self.sizes):
             raise UsageError("a set needs at least one session")
+        if self.seed < 0:
+            raise UsageError(f"--seed is {self.seed}: it must not be below 0")
+        if not all(0 <= std <= LARGEST["noise_std"] for std in self.noise_stds):
+            stds = ", ".join(f"{std:g}" for std in self.noise_stds)
+            raise UsageError(f"--noise-std is {stds}: it must be from 0 to {LARGEST['noise_std']:g} m")
         if not 0 <= self.walled <= 1:
             raise UsageError(f"walled is {self.walled:g}: it is a share, from 0 to 1")
 
@@ -198,19 +204,41 @@ def make_dataset(
 def _prepare_folder(folder: Path, options: DatasetOptions) -> None:
     """Make the folders and the manifest, or check that the manifest is that of these options."""
     manifest = strict_json.dumps({"version": 1, "tile": TILE_SIZE} | asdict(options), indent=1) + "\n"
+    parts = [f"{kind}/{mapper}" for kind in ("images", "labels") for mapper in options.mappers]
+    prepare_folder(folder, manifest, ["truth", "done", *parts])
+
+
+def prepare_folder(folder: Path, manifest: str, parts: Iterable[str]) -> None:
+    """Make the folders and the manifest of a set, or check that the manifest is that of a set to be continued.
+
+    Args:
+        folder: The set's folder.
+        manifest: What the manifest holds.
+        parts: The folders in it that hold a folder for each split.
+
+    Raises:
+        UsageError: The folder holds a set with other options, or files that are none of a set.
+        OutputError: It cannot be written.
+    """
     path = folder / "manifest.json"
-    try:
+    with output_errors(folder):
+        folder.mkdir(parents=True, exist_ok=True)
+        other = None if path.exists() else _other_file(folder)
+        if other and not path.exists():  # else another process has just begun the same set
+            raise UsageError(f"{folder} holds {other}, which is of no set: give another folder")
         if path.exists() and path.read_bytes() != manifest.encode():
             raise UsageError(f"{folder} holds a set that was made with other options: give another folder")
-        for split in SPLITS:
-            (folder / "truth" / split).mkdir(parents=True, exist_ok=True)
-            (folder / "done" / split).mkdir(parents=True, exist_ok=True)
-            for mapper in options.mappers:
-                for kind in ("images", "labels"):
-                    (folder / kind / mapper / split).mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise OutputError(folder, error) from error
     write_file(path, manifest.encode(), OF_THE_SET)
+    with output_errors(folder):
+        for part in parts:
+            for split in SPLITS:
+                (folder / part / split).mkdir(parents=True, exist_ok=True)
+
+
+def _other_file(folder: Path) -> Path | None:
+    """Return a file, relative to the folder that it lies in at some depth; None where there is none."""
+    found = (path for path in folder.rglob("*") if path.suffix != ".part" and not path.is_dir())
+    return next((path.relative_to(folder) for path in found), None)
 
 
 def _done(folder: Path, split: str, seed: int) -> Path:

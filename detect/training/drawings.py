@@ -24,6 +24,7 @@ from detect.training.dataset import (
     Progress,
     bounding_box,
     output_failure,
+    prepare_folder,
     write_data_yaml,
     write_image,
     yolo_label,
@@ -31,7 +32,7 @@ from detect.training.dataset import (
 from mapping.grid import UNKNOWN_GREY, GridFrame
 from prim import strict_json
 from prim.errors import OutputError, UsageError
-from prim.files import output_errors, write_file
+from prim.files import write_file
 from prim.processes import process_pool
 from prim.shapes import Kind, Primitive
 
@@ -81,6 +82,8 @@ class DrawingOptions:
     def __post_init__(self) -> None:
         if min(self.sizes) < 0 or not sum(self.sizes):
             raise UsageError("a set needs at least one drawing")
+        if self.seed < 0:
+            raise UsageError(f"--seed is {self.seed}: it must not be below 0")
 
 
 def make_drawings(folder: Path, options: DrawingOptions, progress: Progress | None = None) -> int:
@@ -99,14 +102,7 @@ def make_drawings(folder: Path, options: DrawingOptions, progress: Progress | No
         UsageError: The folder holds a data set with other options.
     """
     manifest = strict_json.dumps({"version": 2, "tile": TILE_SIZE} | vars(options)) + "\n"
-    path = folder / "manifest.json"
-    with output_errors(folder):
-        if path.exists() and path.read_bytes() != manifest.encode():
-            raise UsageError(f"{folder} holds a set that was made with other options: give another folder")
-        for split in SPLITS:
-            for kind in ("images", "labels"):
-                (folder / kind / DRAWINGS / split).mkdir(parents=True, exist_ok=True)
-    write_file(path, manifest.encode(), OF_THE_SET)
+    prepare_folder(folder, manifest, [f"{kind}/{DRAWINGS}" for kind in ("images", "labels")])
     missing = [job for job in _drawing_seeds(options) if not _image_path(folder, *job).exists()]
     with process_pool() as pool:
         for done, failed in enumerate(pool.map(partial(_make_drawing, folder), missing, chunksize=50), start=1):

@@ -45,6 +45,11 @@ def test_a_data_set_is_made_and_continued(run: Run) -> None:
         (["dataset", "a", "--maps", "0", "0"], "at least one session"),
         (["dataset", "a", "--mapper", "magic"], "--mapper"),
         (["dataset", "a", "--kind", "magic"], "choose from all, square"),
+        (["dataset", "a", "--noise-std", "nan"], "--noise-std is nan: it must be from 0 to 1000 m"),
+        (["dataset", "a", "--noise-std", "1e308"], "--noise-std is 1e+308"),
+        (["dataset", "a", "--seed", "-1"], "--seed is -1: it must not be below 0"),
+        (["dataset", "a", "--workers", "-1"], "--workers"),
+        (["drawings", "a", "--seed", "-1"], "--seed is -1: it must not be below 0"),
         (["magic"], "magic"),
         ([], "Missing command. (try: prim-train --help)"),
     ],
@@ -52,6 +57,17 @@ def test_a_data_set_is_made_and_continued(run: Run) -> None:
 def test_impossible_options(run: Run, arguments: list[str], said: str) -> None:
     code, _, err = run(*arguments)
     assert code == 2 and said in err and err.count("\n") == 1
+
+
+@pytest.mark.parametrize("command", [("dataset", "--maps", 1, 1, "--mapper", "det"), ("drawings", "--images", 1, 1)])
+def test_a_folder_of_other_files_takes_no_set(run: Run, command: tuple[object, ...]) -> None:
+    """They might have the names of its own."""
+    Path("mine").mkdir()
+    Path("mine/drawings.yaml").write_text("important: true")
+    name, *options = command
+    code, _, err = run(name, "mine", *options)
+    assert (code, err.count("\n"), "mine holds drawings.yaml, which is of no set" in err) == (2, 1, True)
+    assert [path.read_text() for path in Path("mine").iterdir()] == ["important: true"]
 
 
 def test_the_presets_are_those_that_exist() -> None:

@@ -13,7 +13,7 @@ import pytest
 import rerun as rr
 
 from mapping.grid import OccupancyGrid
-from prim.errors import UsageError
+from prim.errors import OutputError, UsageError
 from prim.log import open_log
 from prim.log.messages import SCAN_TOPIC, decode_scan
 from prim.se2 import Pose2D
@@ -106,6 +106,16 @@ def test_what_a_terminal_obeys_is_not_in_the_recording(tmp_path: Path, noisy_ses
     assert value(rows["/__properties"][-1], "name") == [r"a\x1b[2J.mcap (prob)"]
     assert value(rows["/events"][-1], "text") == [r"a topic\x1b[2J"]
     assert r"| **log** | a\x1b[2J.mcap, " in value(rows["/summary"][0], "text")[0]
+
+
+def test_a_recording_that_somebody_removes_is_an_expected_error(tmp_path: Path, noisy_session: Session) -> None:
+    """Which does not cost the report."""
+    viewer = RerunViewer(ViewerOptions(save=tmp_path / "a.rrd"), announce=print)
+    result = Pipeline(noisy_session.path, ReplayOptions(selection=Selection(n_scans=2)), viewer).run()
+    (part,) = tmp_path.iterdir()
+    part.unlink()
+    with pytest.raises(OutputError, match=r"a\.rrd: cannot write"):
+        viewer.finish([result])
 
 
 def test_a_viewer_is_spawned_for_the_recording_and_sends_no_usage_data(
