@@ -36,7 +36,7 @@ def run(app: typer.Typer, name: str, arguments: Sequence[str]) -> int:
 
     Returns:
         The exit code. 0: done; 1: an input that cannot be used, an output that cannot be written, or a bug; 2: usage;
-        3: done, but part of a log was lost; 130: interrupted; 143: terminated.
+        3: done, but part of a log was lost; 130: interrupted; 143: terminated; 129: its terminal was closed.
     """
     debug = "--debug" in arguments
     gc.set_threshold(100_000, 50, 50)  # imports make many objects that stay: collecting among them takes 0.4 s

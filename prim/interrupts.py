@@ -14,8 +14,8 @@ from prim.errors import InterruptedRunError
 
 Item = TypeVar("Item")
 
-SIGNALS = (signal.SIGINT, signal.SIGTERM)
-"""What interrupts a command: Ctrl-C, and what ``kill``, containers and job queues send."""
+SIGNALS = tuple(signal.Signals[name] for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name))
+"""What interrupts a command: Ctrl-C; what ``kill``, containers and job queues send; a terminal that is closed."""
 
 HELD_BACK = b"interrupted: finishing what was begun; Ctrl-C again ends at once\n"
 

@@ -14,6 +14,8 @@ from recorder.world import WorldOptions
 
 if signal.getsignal(signal.SIGINT) == signal.SIG_IGN:  # as a shell starts what runs in the background
     signal.signal(signal.SIGINT, signal.default_int_handler)
+if hasattr(signal, "SIGHUP"):  # which nohup has ignored
+    signal.signal(signal.SIGHUP, signal.SIG_DFL)
 
 settings.register_profile("prim", deadline=None)
 settings.load_profile("prim")

@@ -56,7 +56,7 @@ def interrupted(folder: Path, log: Path, number: int, *options: str) -> tuple[in
     return process.wait(30), process.communicate()[1]
 
 
-@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143), (signal.SIGHUP, 129)])
 def test_an_interrupted_replay_keeps_what_was_made(
     tmp_path: Path, noisy_session: Session, number: int, code: int
 ) -> None:
