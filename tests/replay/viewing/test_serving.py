@@ -49,7 +49,7 @@ def listening(port: int) -> set[str]:
 
 
 def with_home(home: Path) -> dict[str, str]:
-    """An environment in which rerun reports its usage and logs nothing, unless it is told otherwise."""
+    """An environment in which rerun reports its usage and logs nothing, unless the server sets it otherwise."""
     kept = {name: value for name, value in os.environ.items() if name != "CI" and not name.startswith("XDG_")}
     return kept | {"HOME": str(home), "FORCE_RERUN_ANALYTICS": "1", "RUST_LOG": "off"}
 
