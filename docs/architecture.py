@@ -45,7 +45,7 @@ SCAN = (
     ),
     Stage(
         "Select and decode scans",
-        (("replay/posed_scans.py", "ScanLog"), ("prim/log/messages.py", "decode_scan")),
+        (("replay/posed_scans.py", "ScanLog"), ("prim/log/decoding/ros.py", "decode_scan")),
         "Scan: every range classified",
     ),
     Stage(

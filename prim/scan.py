@@ -65,6 +65,8 @@ class Scan:
         time_increment: From one beam to the next (s).
         scan_time: From one scan to the next (s).
         first_beam: Which beam of the sweep the first one is: not 0 in a part of a sweep.
+        angle_max: Bearing of the last beam as the log says it (rad); NaN where it does not. Beams are where
+            ``angle_increment`` puts them; :func:`reconciled_angles` compares both.
     """
 
     stamp: int
@@ -77,6 +79,7 @@ class Scan:
     time_increment: float = 0.0
     scan_time: float = 0.0
     first_beam: int = 0
+    angle_max: float = math.nan
 
     @property
     def problem(self) -> str | None:

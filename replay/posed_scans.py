@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from prim.arrays import Stamps
 from prim.errors import LogReadError
-from prim.log.messages import SCAN_TYPE, decode_scan, decode_stamp
+from prim.log.decoding.codecs import Content
 from prim.log.source import LogSource, Topic
 from prim.scan import PosedScan, Scan, deskew, mirror_scan
 from replay.notes import pluralize
@@ -98,7 +98,7 @@ class ScanLog:
     def __iter__(self) -> Iterator[tuple[int, Scan]]:
         """Iterate over (position in the selection, scan), read from the log; unusable scans are left out."""
         positions = {index: position for position, index in enumerate(self._indices.tolist())}
-        for index, _, scan in self._log.numbered(self.topic, decode_scan, wanted=positions):
+        for index, _, _, scan in self._log.numbered(self.topic, wanted=positions):
             if scan.problem:
                 self.unusable[index] = scan.problem
             else:
@@ -131,7 +131,7 @@ class ScanLog:
     def _read_stamps(self) -> tuple[NDArray[np.intp], Stamps]:
         """Read the indices and stamps (ns) of the scans whose header can be read."""
         indices, stamps = [], []
-        for index, _, stamp in self._log.numbered(self.topic, decode_stamp):
+        for index, _, _, stamp in self._log.stamps(self.topic):
             indices.append(index)
             stamps.append(stamp)
         return np.array(indices, dtype=np.intp), np.array(stamps, dtype=np.int64)
@@ -209,18 +209,18 @@ class PosedScans:
 
 
 def _scan_topic(log: LogSource, wanted: str | None) -> Topic:
-    topics = log.of_type(SCAN_TYPE)
+    topics = log.holding(Content.SCAN)
     names = ", ".join(topic.name for topic in topics)
     if wanted is not None:
         chosen = [topic for topic in topics if topic.name == wanted]
         if not chosen:
             hint = f"its scan topics: {names}" if topics else _listing(log)
-            empty = wanted in log.topics and log.topics[wanted].type == SCAN_TYPE
+            empty = wanted in log.topics and log.topics[wanted].content is Content.SCAN
             what = f"no messages on {wanted}" if empty else f"no LaserScan on {wanted}"
             raise LogReadError(log.path, what, hint)
         return chosen[0]
     if not topics:
-        empty_topics = [topic.name for topic in log.topics.values() if topic.type == SCAN_TYPE]
+        empty_topics = [topic.name for topic in log.topics.values() if topic.content is Content.SCAN]
         if empty_topics:
             raise LogReadError(log.path, f"no messages on {', '.join(empty_topics)}", "; ".join(log.lost))
         raise LogReadError(log.path, "no LaserScan in this log", _listing(log))

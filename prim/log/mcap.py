@@ -6,11 +6,10 @@ import os
 import struct
 import zlib
 from collections import Counter
-from collections.abc import Callable, Container, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field
 from itertools import pairwise
-from pathlib import Path
 from typing import IO, TypeVar
 
 from mcap.data_stream import RecordBuilder
@@ -23,8 +22,11 @@ from mcap.stream_reader import StreamReader, get_chunk_data_stream
 from mcap.summary import Summary
 
 from prim.errors import LogReadError
+from prim.log.decoding.codecs import content_of
+from prim.log.log_file import LogFile
+from prim.log.reader import LogReader, ros2_name
 from prim.log.recovery import RECORD_LIMIT, RECOVER_HINT, RecordReader, read_chunk, translated_errors
-from prim.log.source import Decoded, Message, Topic
+from prim.log.source import Message, Topic
 
 MAGIC = b"\x89MCAP0\r\n"
 
@@ -47,26 +49,25 @@ class _Contents:
     metadata: dict[str, Mapping[str, str]] = field(default_factory=dict)
 
 
-class McapReader:
+class McapReader(LogReader):
     """An MCAP log that is open for reading: a :class:`prim.log.source.LogSource`.
 
     An intact log is read by its index, in the order of log times. With ``recover``, every log is read chunk by chunk,
     by the index of chunks where that is intact and else in file order.
 
     Args:
-        path: The file; it begins with MAGIC, as :func:`prim.log.open_log` checks.
+        file: The file; it begins with MAGIC, as :func:`prim.log.open_log` checks.
         recover: Pass over damage, and collect it in :attr:`lost`.
 
     Raises:
         LogReadError: The file cannot be read or is damaged (unless ``recover``).
     """
 
-    def __init__(self, path: Path, recover: bool = False) -> None:
-        self.path = path
-        self.lost: list[str] = []
-        self._recover = recover
-        self._undecodable: set[tuple[str, int]] = set()
-        self._file: IO[bytes] = path.open("rb")
+    _FORMAT = "MCAP"
+
+    def __init__(self, file: LogFile, recover: bool = False) -> None:
+        super().__init__(file.path, recover, file)
+        self._file: IO[bytes] = file.data.open("rb")
         self._records = RecordReader(self._file, self.path, recover)
         self._index = SeekingReader(self._file, validate_crcs=True, record_size_limit=RECORD_LIMIT)
         try:
@@ -75,30 +76,22 @@ class McapReader:
         except BaseException:
             self._file.close()
             raise
+        self.metadata, self.topics = self._contents.metadata, self._read_topics()
 
-    def __enter__(self) -> McapReader:
-        return self
-
-    def __exit__(self, *exception: object) -> None:
+    def close(self) -> None:
+        """Close the file."""
         self._file.close()
 
-    @property
-    def topics(self) -> dict[str, Topic]:
-        """The log's topics by name."""
+    def _read_topics(self) -> dict[str, Topic]:
         topics: dict[str, Topic] = {}
         for channel in self._contents.channels.values():
             schema = self._contents.schemas.get(channel.schema_id)
             count = self._contents.counts[channel.id]
             if channel.topic in topics:
                 count += topics[channel.topic].messages
-            name = schema.name if schema else ""
-            topics[channel.topic] = Topic(channel.topic, _ros2_name(name), channel.message_encoding, count)
+            name = ros2_name(schema.name if schema else "")
+            topics[channel.topic] = Topic(channel.topic, name, channel.message_encoding, count, content_of(name))
         return topics
-
-    @property
-    def metadata(self) -> Mapping[str, Mapping[str, str]]:
-        """The log's metadata records by name."""
-        return self._contents.metadata
 
     def attachment(self, name: str) -> bytes | None:
         """See :meth:`prim.log.source.LogSource.attachment`."""
@@ -131,11 +124,6 @@ class McapReader:
             return None
         unread = self._summary.statistics.message_count - self._contents.counts.total()
         return unread + len(self._undecodable)
-
-    def of_type(self, *types: str) -> list[Topic]:
-        """See :meth:`prim.log.source.LogSource.of_type`."""
-        fitting = (topic for topic in self.topics.values() if topic.type in types and topic.messages)
-        return sorted(fitting, key=lambda topic: topic.name)
 
     def messages(self, *topics: str) -> Iterator[Message]:
         """See :meth:`prim.log.source.LogSource.messages`; a log that is recovered is read in file order."""
@@ -176,40 +164,6 @@ class McapReader:
         for record in self._all_records([]):
             if isinstance(record, McapMessage) and names.get(record.channel_id) in topics:
                 yield Message(names[record.channel_id], record.log_time, record.data)
-
-    def decoded(self, topic: Topic, decode: Callable[[bytes], Decoded]) -> Iterator[tuple[int, Decoded]]:
-        """See :meth:`prim.log.source.LogSource.decoded`."""
-        for _, log_time, decoded in self.numbered(topic, decode):
-            yield log_time, decoded
-
-    def numbered(
-        self, topic: Topic, decode: Callable[[bytes], Decoded], wanted: Container[int] | None = None
-    ) -> Iterator[tuple[int, int, Decoded]]:
-        """See :meth:`prim.log.source.LogSource.numbered`."""
-        if topic.encoding != "cdr":
-            raise LogReadError(
-                self.path,
-                f"{topic.name} is encoded as {topic.encoding!r}, and only 'cdr' (ROS 2) can be read",
-                "convert the log with: rosbags-convert --dst-storage mcap",
-            )
-        for index, message in enumerate(self.messages(topic.name)):
-            if wanted is not None and index not in wanted:
-                continue
-            try:
-                decoded = decode(message.data)
-            except ValueError as error:
-                self._reject(topic, index, error)
-                continue
-            yield index, message.log_time, decoded
-
-    def _reject(self, topic: Topic, index: int, error: ValueError) -> None:
-        """Count a message that cannot be decoded as lost; unless recovering, raise LogReadError."""
-        if not self._recover:
-            what = f"message {index} of {topic.name} cannot be decoded: {error}"
-            raise LogReadError(self.path, what, "pass over such messages with --recover")
-        if not any(name == topic.name for name, _ in self._undecodable):
-            self.lost.append(f"messages of {topic.name} that cannot be decoded, the first one {index}: {error}")
-        self._undecodable.add((topic.name, index))
 
     def _read_summary(self) -> Summary | None:
         """Read the log's summary and check its CRC; None where a complete log has none. Raises LogReadError."""
@@ -283,12 +237,6 @@ class McapReader:
         if self._summary is None or not self._summary.chunk_indexes:
             return self._records.linear(lost)
         return self._records.indexed(self._summary.chunk_indexes, lost)
-
-
-def _ros2_name(name: str) -> str:
-    """Return the ROS 2 name of a message type: of ROS 1's package/Type, package/msg/Type."""
-    parts = name.split("/")
-    return f"{parts[0]}/msg/{parts[1]}" if len(parts) == 2 else name
 
 
 Record = TypeVar("Record", Metadata, Attachment)

@@ -9,7 +9,8 @@ import numpy as np
 
 from prim.arrays import FloatArray, Stamps
 from prim.errors import LogReadError
-from prim.log.messages import BASE_FRAME, MAP_FRAME, POSE_TYPE, TRUE_POSE_TOPIC
+from prim.log.decoding.codecs import Content
+from prim.log.messages import BASE_FRAME, MAP_FRAME, TRUE_POSE_TOPIC
 from prim.log.source import LogSource, Topic
 from prim.se2 import Pose2D, compose_covariances, compose_poses
 from replay.poses.fusion import Fusion, PoseEstimate
@@ -121,7 +122,7 @@ class PoseProvider:
     def has_truth(self) -> bool:
         """Whether the log has true poses."""
         topic = self._log.topics.get(TRUE_POSE_TOPIC)
-        return topic is not None and topic.messages > 0 and topic.type == POSE_TYPE
+        return topic is not None and topic.messages > 0 and topic.content is Content.POSE
 
     def _poses_from(self, source: str, scans: ScanTimes) -> LaserPoses:
         """Return the poses at all query stamps, by the source that is asked for or that ``auto`` chooses."""

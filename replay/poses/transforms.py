@@ -6,13 +6,14 @@ import math
 from collections import Counter, defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
 
 from prim.arrays import FloatArray, Stamps
-from prim.log.messages import MAP_FRAME, ODOM_FRAME, TF_TYPE, StampedPose, decode_poses
+from prim.log.decoding.codecs import Content
+from prim.log.decoding.values import StampedPose
+from prim.log.messages import MAP_FRAME, ODOM_FRAME
 from prim.log.source import LogSource
 from prim.se2 import MAX_COORDINATE
 
@@ -82,10 +83,10 @@ class TransformTree:
         """
         found: dict[tuple[str, str], list[StampedPose]] = defaultdict(list)
         static: set[tuple[str, str]] = set()
-        for topic in log.of_type(TF_TYPE):
+        for topic in log.holding(Content.TRANSFORMS):
             if static_only and not topic.name.endswith(STATIC_SUFFIX):
                 continue
-            for _, poses in log.decoded(topic, partial(decode_poses, TF_TYPE)):
+            for _, poses in log.decoded(topic):
                 for pose in poses:
                     edge = pose.frame_id.lstrip("/"), pose.child_frame_id.lstrip("/")
                     found[edge].append(pose)

@@ -570,4 +570,4 @@ def test_missing_sensors_are_reported(replay: Run, driven_session: Path) -> None
     code, _, err = replay(driven_session, "--pose", "fused", "--fuse", "gps")
     assert code == 1 and "fused poses need odometry, or a GPS and a compass: there is /gps" in err
     code, _, err = replay(driven_session, "--pose", "fused", "--gps-topic", "/odom")
-    assert code == 1 and "topics of that type: /gps" in err
+    assert code == 1 and "topics with such messages: /gps" in err
