@@ -218,6 +218,27 @@ def deskew(
     return pieces
 
 
+def reconciled_angles(scan: Scan) -> Scan:
+    """Return a scan whose beams end at its ``angle_max``, where its ``angle_increment`` contradicts that.
+
+    Args:
+        scan: The scan. An increment that ends within two beams, or one hundredth of the field of view, of angle_max
+            does not contradict it: many drivers count one beam more or less.
+
+    Returns:
+        The scan itself where nothing contradicts, or its ends do not tell more.
+    """
+    steps = len(scan.ranges) - 1
+    field = scan.angle_max - scan.angle_min
+    if steps < 1 or not math.isfinite(field) or field == 0:
+        return scan
+    allowed = max(2 * abs(field) / steps, abs(field) / 100)
+    end = scan.angle_increment * steps
+    if abs(end - field) <= allowed or (end and abs(wrap_angle(end - field)) <= allowed):  # False for NaN
+        return scan
+    return replace(scan, angle_increment=field / steps)
+
+
 def mirror_scan(scan: Scan) -> Scan:
     """Return the scan of a laser that is mounted upside down as one that is not would have taken it."""
     return replace(scan, angle_min=-scan.angle_min, angle_increment=-scan.angle_increment)

@@ -7,12 +7,12 @@ from functools import partial
 from typing import NamedTuple
 
 from prim.errors import LogReadError
-from prim.log.source import LogSource
 from replay.options import ReplayOptions
-from replay.posed_scans import PosedScanOptions, PosedScans, ScanLog
 from replay.poses.fusion_options import FusionInputs, SensorNoise
 from replay.poses.laser_poses import FUSED, LaserPoses
 from replay.poses.pose_provider import PoseProvider
+from replay.scans.posed_scans import PosedScanOptions, PosedScans
+from replay.scans.scan_log import ScanLog
 from replay.timing import StageTimer
 
 
@@ -30,11 +30,10 @@ class Localization(NamedTuple):
     notes: tuple[str, ...]
 
 
-def localize(log: LogSource, scans: ScanLog, options: ReplayOptions, timer: StageTimer) -> Localization:
+def localize(scans: ScanLog, options: ReplayOptions, timer: StageTimer) -> Localization:
     """Find the poses of the laser by the source that is asked for, matched where that is asked for.
 
     Args:
-        log: The log.
         scans: The scans that are replayed.
         options: Options of the replay.
         timer: Counts the time of reading scans that are matched towards the stage «read».
@@ -46,7 +45,7 @@ def localize(log: LogSource, scans: ScanLog, options: ReplayOptions, timer: Stag
         LogReadError: The log has no such poses.
         UsageError: The options do not fit the log.
     """
-    found = _look_up_poses(log, scans, options)
+    found = _look_up_poses(scans, options)
     if not options.match_scans:
         return found
     from replay.poses.scan_matching import match_scans  # when it is needed: a replay without it starts faster
@@ -73,10 +72,10 @@ def pose_scans(scans: ScanLog, poses: LaserPoses, options: ReplayOptions, timer:
     return PosedScans(scans, poses, PosedScanOptions(options.resolution / 2, options.max_range), timer)
 
 
-def _look_up_poses(log: LogSource, scans: ScanLog, options: ReplayOptions) -> Localization:
+def _look_up_poses(scans: ScanLog, options: ReplayOptions) -> Localization:
     """Return the laser's poses by the source that is asked for, and the true ones where the log has them."""
-    provider = PoseProvider(log, options.odom_topic, options.laser_offset, options.fuse)
-    times = scans.times if options.deskew else replace(scans.times, sweep=0)
+    provider = PoseProvider(scans.log, options.odom_topic, options.laser_offset, options.fuse)
+    times = scans.times if options.deskew else scans.times.at_once()
     if options.standing_still:
         return Localization(provider.stationary_poses(times), None, ())
     poses = provider.laser_poses(times, options.pose)

@@ -20,7 +20,7 @@ from prim.scan import PosedScan, Scan
 from prim.se2 import Pose2D
 from prim.world import World
 from replay.options import ReplayOptions
-from replay.posed_scans import PosedScans
+from replay.scans.posed_scans import PosedScans
 from replay.timing import StageTimer
 
 WORLD_MARGIN = 0.1

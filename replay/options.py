@@ -10,13 +10,14 @@ from typing import Final, Literal
 import numpy as np
 
 from mapping.mapper import check_cells, check_mapper, takes_noise
-from prim.choices import MapperName, PoseSourceName, SensorModelName
+from prim.choices import ClockName, MapperName, PoseSourceName, SensorModelName
 from prim.errors import UsageError
 from prim.se2 import Pose2D
 from prim.world import Bounds
 from replay.poses.fusion_options import FusionInputs, SensorNoise
 from replay.poses.laser_poses import FUSED
-from replay.selection import Selection
+from replay.scans.scan_log import ScanLogOptions
+from replay.scans.selection import Selection
 
 END: Final = "end"
 """The value of ``detect_every`` for one detection, after the last scan."""
@@ -45,7 +46,10 @@ class ReplayOptions:
         pose: The source of poses (:class:`prim.choices.PoseSourceName`).
         resolution: Side of a cell (m).
         bounds: Bounds of the map (m): x0, y0, x1, y1; None to choose them.
-        scan_topic: The topic of scans; None where the log has only one.
+        scan_topic: The topics of scans that are mapped together; none: those of all scanners of one robot.
+        clock: The clock that messages are stamped by (:class:`prim.choices.ClockName`).
+        height_slice: The lowest and the highest z (m, in the sensor's frame) of a cloud's points that make a scan;
+            None: all points of a planar scanner.
         odom_topic: The topic of poses; None: found by type. Where one is given, the source ``auto`` means ``odom``.
         laser_offset: The laser's pose on the robot (m, rad); None where tf has it.
         max_range: Ranges beyond this count as no return (m); None for the scanner's own range_max.
@@ -74,7 +78,9 @@ class ReplayOptions:
     pose: str = "auto"
     resolution: float = 0.01
     bounds: Bounds | None = None
-    scan_topic: str | None = None
+    scan_topic: tuple[str, ...] = ()
+    clock: str = ClockName.AUTO.value
+    height_slice: tuple[float, float] | None = None
     odom_topic: str | None = None
     laser_offset: Pose2D | None = None
     max_range: float | None = None
@@ -105,8 +111,19 @@ class ReplayOptions:
             raise UsageError(f"--detect-every is {every}: it must be a number of scans, at least 1, or «{END}»")
         if not self.detect and (self.detect_every or self.weights or not self.refine):
             raise UsageError("--no-detect excludes --detect-every, --weights and --no-refine")
+        if self.clock not in [*ClockName]:
+            raise UsageError(f"--clock is {self.clock!r}: choose from {', '.join(ClockName)}")
+        if self.height_slice is not None and not -math.inf < self.height_slice[0] < self.height_slice[1] < math.inf:
+            raise UsageError(
+                f"--slice is {self.height_slice[0]:g} {self.height_slice[1]:g}: give two heights, the lower first"
+            )
         self._check_poses()
         self._check_noise()
+
+    @property
+    def scan_log(self) -> ScanLogOptions:
+        """How scans are read."""
+        return ScanLogOptions(self.scan_topic, self.clock, self.height_slice)
 
     @property
     def mappers(self) -> tuple[str, ...]:

@@ -35,9 +35,10 @@ ARROWS: dict[str, set[str]] = {
         "prim", "recorder", "mapping", "detect", "detect/networks", "detect/refinement",
         "detect/training",
     },
+    "replay/scans": {"prim", "prim/log", "prim/log/decoding", "replay", "replay/poses"},
     "replay/poses": {"prim", "prim/log", "prim/log/decoding", "mapping", "mapping/forward"},
     "replay/detection": {
-        "prim", "mapping", "detect", "detect/networks", "detect/refinement", "replay", "replay/poses",
+        "prim", "mapping", "detect", "detect/networks", "detect/refinement", "replay", "replay/poses", "replay/scans",
     },
     "replay/outputs": {"prim", "mapping", "detect", "replay", "replay/detection", "replay/poses"},
     "replay/viewing": {
@@ -45,7 +46,7 @@ ARROWS: dict[str, set[str]] = {
     },
     "replay": {
         "prim", "prim/log", "prim/log/decoding", "mapping", "mapping/forward", "detect", "detect/networks",
-        "detect/refinement", "replay/detection", "replay/outputs", "replay/poses", "replay/viewing",
+        "detect/refinement", "replay/scans", "replay/detection", "replay/outputs", "replay/poses", "replay/viewing",
     },
 }  # fmt: skip
 """For each folder the folders that its files may import from, beside itself."""
@@ -61,9 +62,10 @@ ENDS = {
     ("detect/refinement", "detect"): {"detection"},
     ("replay/viewing", "replay"): {"result"},
     ("replay/viewing", "replay/outputs"): {"report"},
+    ("replay/scans", "replay"): {"notes", "timing"},
     ("replay/viewing", "replay/detection"): {"stage"},
     ("replay/outputs", "replay"): {"result", "notes"},
-    ("replay/detection", "replay"): {"ground_truth", "intervals", "options", "posed_scans", "timing"},
+    ("replay/detection", "replay"): {"ground_truth", "intervals", "options", "timing"},
 }
 """Arrows that lead to these files of a folder alone."""
 

@@ -24,7 +24,7 @@ from replay.detection.refiner import DetectionRefiner
 from replay.ground_truth import GroundTruth
 from replay.intervals import detection_interval, is_due
 from replay.options import ReplayOptions
-from replay.posed_scans import PosedScans
+from replay.scans.posed_scans import PosedScans
 from replay.timing import StageTimer
 
 if TYPE_CHECKING:

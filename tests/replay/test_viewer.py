@@ -21,7 +21,7 @@ from recorder.session import Session
 from replay.options import ReplayOptions
 from replay.pipeline import Pipeline
 from replay.result import ReplayResult
-from replay.selection import Selection
+from replay.scans.selection import Selection
 from replay.viewer import RecordingError, RerunViewer
 from replay.viewing.protocol import ViewerOptions
 from replay.viewing.serving import RecordingServer
