@@ -10,7 +10,7 @@ from typing import Final, Literal
 import numpy as np
 
 from mapping.mapper import check_cells, check_mapper, takes_noise
-from prim.choices import MapperName, PoseSourceName, SensorModelName
+from prim.choices import MapperName, PoseSourceName, SensorModelName, SweepName
 from prim.errors import UsageError
 from prim.se2 import Pose2D
 from prim.world import Bounds
@@ -52,6 +52,9 @@ class ReplayOptions:
         standing_still: The robot does not move: map without poses.
         fuse: What poses are fused from.
         deskew: Whether the laser's motion during a scan is compensated for.
+        sweep: When the beams of a scan are measured (:class:`prim.choices.SweepName`). «start»: from the stamp on;
+            «end»: until the stamp; «start-reversed» and «end-reversed»: the last beam first. «auto»: as the log says,
+            unless scans clearly fit each other better otherwise.
         match_scans: Whether poses are corrected by matching scans.
         selection: Which scans are replayed.
         rate: The replay is held to this multiple of the log's speed; None for no limit.
@@ -81,6 +84,7 @@ class ReplayOptions:
     standing_still: bool = False
     fuse: FusionInputs = field(default_factory=FusionInputs)
     deskew: bool = True
+    sweep: str = SweepName.AUTO.value
     match_scans: bool = False
     selection: Selection = field(default_factory=Selection)
     rate: float | None = None
@@ -105,6 +109,10 @@ class ReplayOptions:
             raise UsageError(f"--detect-every is {every}: it must be a number of scans, at least 1, or «{END}»")
         if not self.detect and (self.detect_every or self.weights or not self.refine):
             raise UsageError("--no-detect excludes --detect-every, --weights and --no-refine")
+        if self.sweep not in [*SweepName]:
+            raise UsageError(f"--sweep is {self.sweep!r}: choose from {', '.join(SweepName)}")
+        if not self.deskew and self.sweep != SweepName.AUTO:
+            raise UsageError("--no-deskew excludes --sweep")
         self._check_poses()
         self._check_noise()
 

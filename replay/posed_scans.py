@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
@@ -16,7 +17,7 @@ from prim.log.messages import SCAN_TYPE, decode_scan, decode_stamp
 from prim.log.source import LogSource, Topic
 from prim.scan import PosedScan, Scan, deskew, mirror_scan
 from replay.notes import pluralize
-from replay.poses.laser_poses import LaserPoses, ScanTimes
+from replay.poses.laser_poses import BeamTimes, LaserPoses, ScanTimes
 from replay.selection import Selection
 from replay.timing import StageTimer
 
@@ -63,6 +64,8 @@ class ScanLog:
             span = f"{(stamps.max() - stamps.min()) / 1e9:.1f} s" if self.total else "none"
             what = f"no scan is selected of the {self.total} on {self.topic.name} ({span} in all)"
             raise LogReadError(log.path, what, "give another --start, --end or --duration")
+        self._offset, self._is_reversed = 0, False
+        self._iterated: NDArray[np.intp] | None = None
         self._indices = decodable[selected]
         self.stamps = stamps[selected]
         self.first = next((scan for _, scan in self), None) or self._none_usable()
@@ -79,8 +82,28 @@ class ScanLog:
 
     @property
     def sweep(self) -> int:
-        """The time (ns) from a scan's first beam to its last; 0 where it is not given or not plausible."""
-        return round(self._given_sweep * 1e9) if 0 < self._given_sweep <= self._max_sweep else 0
+        """The time (ns) from a scan's first beam to its last; 0 where it is not given or not plausible.
+
+        It is negative where beams run against time.
+        """
+        return round(self._given_sweep * 1e9) if 0 < abs(self._given_sweep) <= self._max_sweep else 0
+
+    def retimed(self, times: BeamTimes) -> ScanLog:
+        """Return the scans with stamps (those of the first beams) and time increments by other times of their beams.
+
+        Args:
+            times: When beams are measured, relative to the stamps in the log.
+
+        Returns:
+            The scans; unchanged where a sweep takes no plausible time.
+        """
+        assert not self._offset and not self._is_reversed
+        retimed = copy.copy(self)
+        retimed._offset = round(times.first * abs(self.sweep))
+        retimed._is_reversed = (times.last - times.first) * self.sweep < 0
+        retimed.stamps = self.stamps + retimed._offset
+        retimed.first = retimed._with_times(self.first)
+        return retimed
 
     @property
     def _given_sweep(self) -> float:
@@ -98,11 +121,26 @@ class ScanLog:
     def __iter__(self) -> Iterator[tuple[int, Scan]]:
         """Iterate over (position in the selection, scan), read from the log; unusable scans are left out."""
         positions = {index: position for position, index in enumerate(self._indices.tolist())}
+        if self._iterated is not None:
+            positions = {int(self._indices[position]): position for position in self._iterated.tolist()}
         for index, _, scan in self._log.numbered(self.topic, decode_scan, wanted=positions):
             if scan.problem:
                 self.unusable[index] = scan.problem
             else:
-                yield positions[index], scan
+                yield positions[index], self._with_times(scan)
+
+    def only(self, positions: NDArray[np.intp]) -> ScanLog:
+        """Return the same scans, of which only those at these positions (M,) are iterated over."""
+        only = copy.copy(self)
+        only._iterated = positions
+        return only
+
+    def _with_times(self, scan: Scan) -> Scan:
+        """Return a scan with its first beam's stamp and its time increment, where these are not those in the log."""
+        if not self._offset and not self._is_reversed:
+            return scan
+        increment = -scan.time_increment if self._is_reversed else scan.time_increment
+        return replace(scan, stamp=scan.stamp + self._offset, time_increment=increment)
 
     def notes(self) -> list[str]:
         """Return what a user should know of scans that were left out, not deskewed, or have irregular stamps."""

@@ -5,13 +5,13 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from prim.arrays import FloatArray, Stamps
-from prim.choices import PoseSourceName
+from prim.choices import PoseSourceName, SweepName
 from prim.se2 import Pose2D
 
 if TYPE_CHECKING:
@@ -26,6 +26,37 @@ EXACT_SOURCES = (PoseSourceName.TRUTH.value, STILL)
 """The sources of poses without errors."""
 
 
+class BeamTimes(NamedTuple):
+    """When a scan's first and last beams are measured: from its stamp on, in units of the time that a sweep takes."""
+
+    first: float
+    last: float
+
+
+BEAM_TIMES: Mapping[str, BeamTimes] = {
+    SweepName.START.value: BeamTimes(0.0, 1.0),
+    SweepName.END.value: BeamTimes(-1.0, 0.0),
+    SweepName.START_REVERSED.value: BeamTimes(1.0, 0.0),
+    SweepName.END_REVERSED.value: BeamTimes(0.0, -1.0),
+}
+"""The times of beams by the name of the option."""
+
+AT_ONCE = BeamTimes(0.0, 0.0)
+"""All beams are measured at the stamp."""
+
+
+def stated_beam_times(sweep: int) -> BeamTimes:
+    """Return what a log says of its beams: they follow the stamp, or go before it where time_increment is negative.
+
+    Args:
+        sweep: The time (ns) from a scan's first beam to its last.
+
+    Returns:
+        The times of the beams.
+    """
+    return BEAM_TIMES[SweepName.START if sweep >= 0 else SweepName.END_REVERSED]
+
+
 @dataclass(frozen=True)
 class ScanTimes:
     """When N scans were taken.
@@ -33,7 +64,8 @@ class ScanTimes:
     Attributes:
         stamps: Of each scan's first beam (N,) in ns.
         frame_id: The laser's frame.
-        sweep: The time (ns) from a scan's first beam to its last; 0: all beams are taken at once.
+        sweep: The time (ns) from a scan's first beam to its last, negative where they run against time; 0: all beams
+            are taken at once.
     """
 
     stamps: Stamps
