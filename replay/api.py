@@ -236,8 +236,8 @@ def _posed_scans(path: Path, options: ReplayOptions) -> Iterator[tuple[Scan, Pos
         prim.log.open_log(path, recover=options.recover) as source,
     ):
         scans = ScanLog(source, options.selection, options.scan_log)
-        poses = localize(scans, options, timer).poses
-        for posed in pose_scans(scans, poses, options, timer):
+        found = localize(scans, options, timer)
+        for posed in pose_scans(found.scans, found.poses, options, timer):
             yield from posed.pieces
 
 

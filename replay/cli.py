@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import typer
 
 from prim import __version__, console
-from prim.choices import ClockName, MapperName, PoseSourceName, SensorModelName
+from prim.choices import ClockName, MapperName, PoseSourceName, SensorModelName, SweepName
 from prim.errors import InterruptedRunError, PrimError, UsageError
 from prim.interrupts import interrupted_run
 
@@ -104,6 +104,13 @@ def replay(
     no_deskew: Annotated[
         bool, typer.Option("--no-deskew", help="Treat all beams of a scan as measured at its stamp.")
     ] = False,
+    sweep: Annotated[
+        SweepName,
+        typer.Option(
+            help="What a scan's stamp is the time of, its first or its last beam; reversed: the last beam is measured "
+            "first. auto: as the log says, unless scans clearly fit each other better otherwise."
+        ),
+    ] = SweepName.AUTO,
     start: Annotated[float | None, typer.Option(metavar="S", help="Begin S seconds into the log.")] = None,
     end: Annotated[float | None, typer.Option(metavar="S", help="End S seconds into the log.")] = None,
     duration: Annotated[float | None, typer.Option(metavar="S", help="Replay S seconds.")] = None,
@@ -236,6 +243,7 @@ def replay(
         pose_noise=_in_radians(pose_noise),
         odom_noise=_in_radians(odom_noise),
         deskew=not no_deskew,
+        sweep=sweep.value,
         match_scans=match_scans,
         start=start,
         end=end,

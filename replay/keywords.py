@@ -47,6 +47,7 @@ class ReplayKeywords(TypedDict, total=False):
     """Standard deviations of the odometry's position (m) and heading (rad) after one metre."""
     match_scans: bool
     deskew: bool
+    sweep: str
     start: float | None
     end: float | None
     duration: float | None

@@ -10,7 +10,7 @@ from typing import Final, Literal
 import numpy as np
 
 from mapping.mapper import check_cells, check_mapper, takes_noise
-from prim.choices import ClockName, MapperName, PoseSourceName, SensorModelName
+from prim.choices import ClockName, MapperName, PoseSourceName, SensorModelName, SweepName
 from prim.errors import UsageError
 from prim.se2 import Pose2D
 from prim.world import Bounds
@@ -56,6 +56,9 @@ class ReplayOptions:
         standing_still: The robot does not move: map without poses.
         fuse: What poses are fused from.
         deskew: Whether the laser's motion during a scan is compensated for.
+        sweep: When the beams of a scan are measured (:class:`prim.choices.SweepName`). «start»: from the stamp on;
+            «end»: until the stamp; «start-reversed» and «end-reversed»: the last beam first. «auto»: as the log says,
+            unless scans clearly fit each other better otherwise.
         match_scans: Whether poses are corrected by matching scans.
         selection: Which scans are replayed.
         rate: The replay is held to this multiple of the log's speed; None for no limit.
@@ -87,6 +90,7 @@ class ReplayOptions:
     standing_still: bool = False
     fuse: FusionInputs = field(default_factory=FusionInputs)
     deskew: bool = True
+    sweep: str = SweepName.AUTO.value
     match_scans: bool = False
     selection: Selection = field(default_factory=Selection)
     rate: float | None = None
@@ -113,10 +117,13 @@ class ReplayOptions:
             raise UsageError("--no-detect excludes --detect-every, --weights and --no-refine")
         if self.clock not in [*ClockName]:
             raise UsageError(f"--clock is {self.clock!r}: choose from {', '.join(ClockName)}")
-        if self.height_slice is not None and not -math.inf < self.height_slice[0] < self.height_slice[1] < math.inf:
-            raise UsageError(
-                f"--slice is {self.height_slice[0]:g} {self.height_slice[1]:g}: give two heights, the lower first"
-            )
+        lowest, highest = self.height_slice or (0.0, 1.0)
+        if not -math.inf < lowest < highest < math.inf:
+            raise UsageError(f"--slice is {lowest:g} {highest:g}: give two heights, the lower first")
+        if self.sweep not in [*SweepName]:
+            raise UsageError(f"--sweep is {self.sweep!r}: choose from {', '.join(SweepName)}")
+        if not self.deskew and self.sweep != SweepName.AUTO:
+            raise UsageError("--no-deskew excludes --sweep")
         self._check_poses()
         self._check_noise()
 

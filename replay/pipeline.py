@@ -90,7 +90,7 @@ class Pipeline:
         ):
             scans = self._read_scans(log)
             truth = self._read_truth(scans.log)
-            poses, true_poses, _ = self._localize(scans)
+            scans, poses, true_poses, _ = self._localize(scans)
             posed_scans = pose_scans(scans, poses, self.options, self._timer)
             frame = choose_grid_frame(posed_scans, self.options, truth.world if truth else None)
             evaluator = ReplayEvaluator(frame, truth, poses, true_poses)

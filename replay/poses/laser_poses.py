@@ -82,6 +82,11 @@ class ScanTimes:
         sweeps = np.array(self.sweeps, dtype=np.int64)[self._scanner]
         return np.concatenate((self.stamps, self.stamps + sweeps))
 
+    @property
+    def sweep(self) -> int:
+        """The time (ns) of the first laser's sweep."""
+        return self.sweeps[0] if self.sweeps else 0
+
     def query_rows(self, laser: int) -> NDArray[np.intp]:
         """Return which of the query stamps are those of a laser."""
         rows = np.flatnonzero(self._scanner == laser)
