@@ -49,13 +49,3 @@ class PoseSourceName(StrEnum):
     TF = "tf"
     ODOM = "odom"
     FUSED = "fused"
-
-
-class SweepName(StrEnum):
-    """When the beams of a scan are measured: first to last or reversed, and which end of the sweep the stamp is."""
-
-    START = "start"
-    END = "end"
-    START_REVERSED = "start-reversed"
-    END_REVERSED = "end-reversed"
-    AUTO = "auto"

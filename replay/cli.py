@@ -107,7 +107,7 @@ def replay(
     sweep: Annotated[
         SweepName,
         typer.Option(
-            help="What a scan's stamp is the time of, its first or its last beam; reversed: the last beam is measured "
+            help="What a scan's stamp is the time of, its first or last beam; reversed: the last beam is measured "
             "first. auto: as the log says, unless scans clearly fit each other better otherwise."
         ),
     ] = SweepName.AUTO,

@@ -134,7 +134,9 @@ def write_bag(
     bag = BagWriter(folder / "bag", version=version, storage_plugin=plugin)
     bag.set_compression(mode, CompressionFormat.ZSTD)
     with bag:
-        connections = {topic: bag.add_connection(topic, kind, typestore=store) for topic, kind in content.types.items()}
+        connections = {
+            topic: bag.add_connection(topic, kind, typestore=store) for topic, kind in content.types.items()
+        }
         for topic, log_time, data in content.messages:
             bag.write(connections[topic], log_time, data)
     return folder / "bag"
@@ -229,7 +231,9 @@ def _write_split(content: LogContent, folder: Path, storage: str, count: int, zs
         path.unlink()
         (bag / names[-1]).write_bytes(zstandard.compress(data) if zstd else data)
     with (bag / "metadata.yaml").open("w", encoding="utf-8") as stream:
-        YAML(typ="safe").dump({"rosbag2_bagfile_information": _bag_information(content, names, storage, zstd)}, stream)
+        YAML(typ="safe").dump(
+            {"rosbag2_bagfile_information": _bag_information(content, names, storage, zstd)}, stream
+        )
     return bag
 
 
