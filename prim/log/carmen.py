@@ -288,7 +288,8 @@ class CarmenReader(LogReader):
         ranges = np.array(scan.readings, dtype=np.float32)
         longest = scan.max_range or self._max_range.get(line.name, DEFAULT_MAX_RANGE)
         stamp = _nanoseconds(scan.stamp) if time is None else time
-        return Scan(stamp, line.name.lower(), scan.angle_min, scan.increment, 0.0, longest, ranges)
+        first, increment, limit = (float(np.float32(value)) for value in (scan.angle_min, scan.increment, longest))
+        return Scan(stamp, line.name.lower(), first, increment, 0.0, limit, ranges)  # in a LaserScan's precision
 
     def _decode_pose(self, data: bytes, reads_laser: bool) -> StampedPose:
         time, line = self._split(data)
