@@ -217,6 +217,7 @@ class Pipeline:
         return tuple(
             ReplayResult(
                 path=self.path,
+                format=log.format,
                 options=branch.options,
                 duration=scans.duration(done),
                 scans=scans.total,

@@ -22,6 +22,7 @@ class ReplayResult:
 
     Attributes:
         path: The log's path.
+        format: The log's format, for people.
         options: The options of the replay, with this mapper alone.
         duration: The time from the earliest selected scan to the latest (s).
         scans: The number of scans on the topic.
@@ -45,6 +46,7 @@ class ReplayResult:
     """
 
     path: Path
+    format: str
     options: ReplayOptions
     duration: float
     scans: int

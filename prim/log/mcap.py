@@ -16,17 +16,18 @@ from mcap.data_stream import RecordBuilder
 from mcap.exceptions import EndOfFile, McapError
 from mcap.opcode import Opcode
 from mcap.reader import SeekingReader
-from mcap.records import Attachment, Channel, McapRecord, Metadata, Schema
+from mcap.records import Attachment, Channel, McapRecord, MessageIndex, Metadata, Schema
 from mcap.records import Message as McapMessage
 from mcap.stream_reader import StreamReader, get_chunk_data_stream
 from mcap.summary import Summary
 
 from prim.errors import LogReadError
-from prim.log.decoding.codecs import content_of
+from prim.log.decoding.codecs import SCAN_CONTENTS, content_of
 from prim.log.log_file import LogFile
 from prim.log.reader import LogReader, ros2_name
 from prim.log.recovery import RECORD_LIMIT, RECOVER_HINT, RecordReader, read_chunk, translated_errors
 from prim.log.source import Message, Topic
+from prim.log.time_resets import find_shifts, moved_behind_resets
 
 MAGIC = b"\x89MCAP0\r\n"
 
@@ -77,6 +78,7 @@ class McapReader(LogReader):
             self._file.close()
             raise
         self.metadata, self.topics = self._contents.metadata, self._read_topics()
+        self._shifts = self._find_shifts()
 
     def close(self) -> None:
         """Close the file."""
@@ -130,6 +132,9 @@ class McapReader(LogReader):
         if self._recover or self._summary is None or not self._summary.chunk_indexes:
             yield from self._unindexed_messages(topics)
             return
+        if len(self._shifts) > 1:
+            yield from moved_behind_resets(self._unindexed_messages(topics), self._shifts)
+            return
         delivered: Counter[str] = Counter()
         with translated_errors(self.path):
             for message in self._indexed_messages(self._summary, topics):
@@ -158,6 +163,29 @@ class McapReader(LogReader):
                 continue
             stream, length = get_chunk_data_stream(read_chunk(self._file, index), validate_crc=True)
             yield from sorted(_chunk_messages(stream.read(length), wanted), key=lambda message: message.log_time)
+
+    def _find_shifts(self) -> tuple[int, ...]:
+        """Find out by the index whether the log's times were set back, and note that."""
+        scans = {k for k, c in self._contents.channels.items() if self.topics[c.topic].content in SCAN_CONTENTS}
+        if self._recover or self._summary is None or not scans:
+            return (0,)
+        with translated_errors(self.path):
+            shifts = find_shifts(self._written_times(self._summary, min(scans)))
+        if len(shifts) > 1:
+            times = f"{len(shifts) - 1} time{'s' * (len(shifts) > 2)}"
+            self.notes = [
+                f"the log's own times are set back {times}, by {shifts[-1] / 1e9:.1f} s in all: what "
+                "follows is put behind what was before"
+            ]
+        return shifts
+
+    def _written_times(self, summary: Summary, channel: int) -> Iterator[int]:
+        """Yield when the messages of a channel were logged (ns), in the order in which they were written."""
+        for chunk in sorted(summary.chunk_indexes, key=lambda index: index.chunk_start_offset):
+            at = chunk.message_index_offsets.get(channel)
+            if at is not None:
+                index = _record_at(self._file, at, MessageIndex)
+                yield from (time for time, _ in sorted(index.records, key=lambda record: record[1]))
 
     def _unindexed_messages(self, topics: tuple[str, ...]) -> Iterator[Message]:
         names = {number: channel.topic for number, channel in self._contents.channels.items()}
@@ -239,7 +267,7 @@ class McapReader(LogReader):
         return self._records.indexed(self._summary.chunk_indexes, lost)
 
 
-Record = TypeVar("Record", Metadata, Attachment)
+Record = TypeVar("Record", Metadata, Attachment, MessageIndex)
 
 
 def _record_at(stream: IO[bytes], offset: int, kind: type[Record]) -> Record:

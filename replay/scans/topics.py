@@ -6,12 +6,9 @@ from collections.abc import Sequence
 from itertools import pairwise
 
 from prim.errors import LogReadError
-from prim.log.decoding.codecs import Content
+from prim.log.decoding.codecs import SCAN_CONTENTS, Content
 from prim.log.source import LogSource, Topic
 from replay.poses.transforms import TransformTree
-
-SCAN_CONTENTS = (Content.SCAN, Content.CLOUD)
-"""What scans can be made of."""
 
 
 def choose_scan_topics(log: LogSource, wanted: Sequence[str]) -> tuple[list[Topic], tuple[str, ...]]:

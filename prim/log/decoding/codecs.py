@@ -35,6 +35,10 @@ class Content(StrEnum):
     """A :class:`.values.StampedPrimitives`."""
 
 
+SCAN_CONTENTS = (Content.SCAN, Content.CLOUD)
+"""What scans can be made of."""
+
+
 class Codec(NamedTuple):
     """How the messages of a topic are decoded.
 
