@@ -12,15 +12,17 @@ from dataclasses import dataclass, field
 from itertools import pairwise
 from typing import IO, TypeVar
 
+import numpy as np
 from mcap.data_stream import RecordBuilder
 from mcap.exceptions import EndOfFile, McapError
 from mcap.opcode import Opcode
 from mcap.reader import SeekingReader
-from mcap.records import Attachment, Channel, McapRecord, MessageIndex, Metadata, Schema
+from mcap.records import Attachment, Channel, McapRecord, Metadata, Schema
 from mcap.records import Message as McapMessage
 from mcap.stream_reader import StreamReader, get_chunk_data_stream
 from mcap.summary import Summary
 
+from prim.arrays import Stamps
 from prim.errors import LogReadError
 from prim.log.decoding.codecs import SCAN_CONTENTS, content_of
 from prim.log.log_file import LogFile
@@ -38,6 +40,8 @@ _RECORD = struct.Struct("<BQ")
 """The prefix of every record: opcode and length."""
 _MESSAGE = struct.Struct("<HIQQ")
 """The prefix of a message record: channel, sequence, log time, publish time."""
+_MESSAGE_INDEX = struct.Struct("<BQHI")
+"""The start of an index of messages: opcode, length, channel, and the length of its entries (log time, offset)."""
 
 
 @dataclass
@@ -170,7 +174,8 @@ class McapReader(LogReader):
         if self._recover or self._summary is None or not scans:
             return (0,)
         with translated_errors(self.path):
-            shifts = find_shifts(self._written_times(self._summary, min(scans)))
+            parts = list(self._written_times(self._summary, min(scans)))
+            shifts = find_shifts(np.concatenate(parts)) if parts else (0,)
         if len(shifts) > 1:
             times = f"{len(shifts) - 1} time{'s' * (len(shifts) > 2)}"
             self.notes = [
@@ -179,13 +184,17 @@ class McapReader(LogReader):
             ]
         return shifts
 
-    def _written_times(self, summary: Summary, channel: int) -> Iterator[int]:
-        """Yield when the messages of a channel were logged (ns), in the order in which they were written."""
+    def _written_times(self, summary: Summary, channel: int) -> Iterator[Stamps]:
+        """Yield for each chunk when messages of a channel were logged (ns), in the order in which they were written."""
         for chunk in sorted(summary.chunk_indexes, key=lambda index: index.chunk_start_offset):
             at = chunk.message_index_offsets.get(channel)
             if at is not None:
-                index = _record_at(self._file, at, MessageIndex)
-                yield from (time for time, _ in sorted(index.records, key=lambda record: record[1]))
+                self._file.seek(at)
+                opcode, _, _, size = _MESSAGE_INDEX.unpack(self._file.read(_MESSAGE_INDEX.size))
+                entries = np.frombuffer(self._file.read(size), "<u8").reshape(-1, 2)
+                if opcode != Opcode.MESSAGE_INDEX:
+                    raise McapError(f"no index of messages at byte {at}")
+                yield entries[np.argsort(entries[:, 1], kind="stable"), 0].astype(np.int64)
 
     def _unindexed_messages(self, topics: tuple[str, ...]) -> Iterator[Message]:
         names = {number: channel.topic for number, channel in self._contents.channels.items()}
@@ -267,7 +276,7 @@ class McapReader(LogReader):
         return self._records.indexed(self._summary.chunk_indexes, lost)
 
 
-Record = TypeVar("Record", Metadata, Attachment, MessageIndex)
+Record = TypeVar("Record", Metadata, Attachment)
 
 
 def _record_at(stream: IO[bytes], offset: int, kind: type[Record]) -> Record:

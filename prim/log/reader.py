@@ -77,16 +77,16 @@ class LogReader(ABC):
 
     def decoded(self, topic: Topic) -> Iterator[tuple[int, object]]:
         """See :meth:`prim.log.source.LogSource.decoded`."""
-        for message in self.numbered(topic):
-            yield message.log_time, message.value
+        for _, _, log_time, value in self._decoded_by({topic.name: self._codec(topic).decode}, None):
+            yield log_time, value
 
     def numbered(self, *topics: Topic, wanted: Container[int] | None = None) -> Iterator[Numbered]:
         """See :meth:`prim.log.source.LogSource.numbered`."""
-        return self._decoded_by({topic.name: self._codec(topic).decode for topic in topics}, wanted)
+        return map(Numbered._make, self._decoded_by({t.name: self._codec(t).decode for t in topics}, wanted))
 
     def stamps(self, *topics: Topic) -> Iterator[Numbered]:
         """See :meth:`prim.log.source.LogSource.stamps`."""
-        return self._decoded_by({topic.name: self._codec(topic).stamp for topic in topics}, None)
+        return map(Numbered._make, self._decoded_by({t.name: self._codec(t).stamp for t in topics}, None))
 
     def _codec(self, topic: Topic) -> Codec:
         """Return how a topic's messages are decoded. Raises LogReadError."""
@@ -98,38 +98,44 @@ class LogReader(ABC):
 
     def _decoded_by(
         self, decoders: Mapping[str, Callable[[bytes], object]], wanted: Container[int] | None
-    ) -> Iterator[Numbered]:
-        for index, message in enumerate(self.messages(*decoders)):
-            if wanted is not None and index not in wanted:
+    ) -> Iterator[tuple[int, str, int, object]]:
+        """Yield numbers, topics, log times and decoded messages; plain tuples, since scans are most of a log."""
+        for number, (name, log_time, data) in enumerate(self.messages(*decoders)):
+            if wanted is not None and number not in wanted:
                 continue
-            name, log_time, data = message
+            decode = decoders[name]
             try:
-                value = decoders[name](decompressed(data) if data[:4] == ZSTD_MAGIC else data)
+                value = decode(data)
             except ValueError as error:
-                self._reject(name, index, error)
-                continue
-            yield Numbered(index, name, log_time, value)
+                try:
+                    value = decode(_decompressed(data, error))
+                except ValueError as final:
+                    self._reject(name, number, final)
+                    continue
+            yield number, name, log_time, value
 
-    def _reject(self, topic: str, index: int, error: ValueError) -> None:
+    def _reject(self, topic: str, number: int, error: ValueError) -> None:
         """Count a message that cannot be decoded as lost; unless recovering, raise LogReadError."""
         if not self._recover:
-            what = f"message {index} of {topic} cannot be decoded: {error}"
+            what = f"message {number} of {topic} cannot be decoded: {error}"
             raise LogReadError(self.path, what, "pass over such messages with --recover")
         if not any(name == topic for name, _ in self._undecodable):
-            self.lost.append(f"messages of {topic} that cannot be decoded, the first one {index}: {error}")
-        self._undecodable.add((topic, index))
+            self.lost.append(f"messages of {topic} that cannot be decoded, the first one {number}: {error}")
+        self._undecodable.add((topic, number))
 
 
-def decompressed(data: bytes) -> bytes:
-    """Decompress a message that is a frame of zstd. Raises ValueError."""
+def _decompressed(data: bytes, error: ValueError) -> bytes:
+    """Decompress a message that could not be decoded as it is. Raises ``error`` where it is no frame of zstd."""
+    if not data.startswith(ZSTD_MAGIC):
+        raise error
     try:
         with zstandard.ZstdDecompressor().stream_reader(data) as stream:
             size = zstandard.frame_content_size(data)
             message = stream.read(MESSAGE_LIMIT if size < 0 else min(size, MESSAGE_LIMIT))
             if size > MESSAGE_LIMIT or stream.read(1):
                 raise ValueError(f"it is compressed, and larger than {MESSAGE_LIMIT} bytes")
-    except zstandard.ZstdError as error:
-        raise ValueError(f"it is compressed, and damaged: {error}") from error
+    except zstandard.ZstdError as damage:
+        raise ValueError(f"it is compressed, and damaged: {damage}") from damage
     return message
 
 

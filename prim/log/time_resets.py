@@ -4,6 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
 
+import numpy as np
+
+from prim.arrays import Stamps
 from prim.log.source import Message
 
 MIN_RESET = 1_000_000_000
@@ -13,18 +16,20 @@ GAP = 100_000_000
 """What comes after a reset is put so long (ns) behind what was before; set by hand."""
 
 
-def find_shifts(log_times: Iterable[int]) -> tuple[int, ...]:
+def find_shifts(log_times: Stamps) -> tuple[int, ...]:
     """Find out by how much log times are to be moved after each reset, so that they rise.
 
     Args:
-        log_times: When the messages of a topic were logged (ns), in the order in which they were written.
+        log_times: When the N messages of a topic were logged (ns), in the order in which they were written.
 
     Returns:
         What is to be added from the start on (0), and after each reset (ns).
     """
     shifts = [0]
+    if not (log_times < np.maximum.accumulate(log_times) - MIN_RESET).any():
+        return (0,)
     latest: int | None = None
-    for time in log_times:
+    for time in log_times.tolist():
         if latest is not None and time < latest - MIN_RESET:
             shifts.append(shifts[-1] + latest - time + GAP)
             latest = time

@@ -45,9 +45,7 @@ def decode_scan(data: bytes) -> Scan:
     except (struct.error, ValueError):
         return read_scan(CdrReader(data))
     stamp = seconds * SECOND + nanoseconds
-    return Scan(
-        stamp, frame_id, first, increment, shortest, longest, ranges, time_increment, scan_time, angle_max=last
-    )
+    return Scan(stamp, frame_id, first, increment, shortest, longest, ranges, time_increment, scan_time, 0, last)
 
 
 def read_scan(fields: CdrReader) -> Scan:
@@ -64,9 +62,7 @@ def _read_scan(fields: CdrReader, read_ranges: Callable[[CdrReader], NDArray[np.
     stamp, frame_id = fields.header()
     first, last, increment, time_increment, scan_time, shortest, longest = fields.unpack("7f", 4)
     ranges = read_ranges(fields)
-    return Scan(
-        stamp, frame_id, first, increment, shortest, longest, ranges, time_increment, scan_time, angle_max=last
-    )
+    return Scan(stamp, frame_id, first, increment, shortest, longest, ranges, time_increment, scan_time, 0, last)
 
 
 def _first_echoes(fields: CdrReader) -> NDArray[np.float32]:
