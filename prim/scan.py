@@ -234,7 +234,9 @@ def reconciled_angles(scan: Scan) -> Scan:
         return scan
     allowed = max(2 * abs(field) / steps, abs(field) / 100)
     end = scan.angle_increment * steps
-    if abs(end - field) <= allowed or (end and abs(wrap_angle(end - field)) <= allowed):  # False for NaN
+    turns_once = abs(field) + allowed < abs(end) <= 2 * math.pi + allowed
+    wrapped = turns_once and abs(wrap_angle(end - field)) <= allowed
+    if abs(end - field) <= allowed or wrapped:  # both False for NaN
         return scan
     return replace(scan, angle_increment=field / steps)
 
