@@ -33,8 +33,8 @@ TRAJECTORY = ResultFormat(
     "a trajectory of prim-replay", re.compile(rb"\d+\.\d{9}( -?\d+\.\d{9}){2} 0 0 0( -?\d\.\d{9}){2}\n")
 )
 
-_LOG_SUFFIX = re.compile(r"(\.mcap)?(\.[0-9a-f]{8})?\.part$|\.mcap$")
-"""The suffix of a log, or of one that its recorder was killed at."""
+_LOG_SUFFIX = re.compile(r"(\.mcap)?(\.[0-9a-f]{8})?\.part$|\.(mcap|db3|bag|log)(\.(zst|zstd|gz))?$")
+"""The suffix of a log, compressed or not, or of one that its recorder was killed at."""
 
 FREE_THRESHOLD, OCCUPIED_THRESHOLD = 0.196, 0.65
 OCCUPIED_VALUE, UNKNOWN_VALUE, FREE_VALUE = 0, 205, 254

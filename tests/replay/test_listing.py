@@ -10,6 +10,7 @@ from recorder.session import Session
 from replay.cli import app
 from replay.listing import summarize_log
 from replay.options import ReplayOptions
+from replay.outputs.exports import log_stem
 
 
 def listed(*arguments: object) -> int:
@@ -56,3 +57,14 @@ def test_options_that_do_not_go_with_the_list(noisy_session: Session, capsys: py
     for options in (["--list", "--report", "r.json"], ["--list", "--spawn"], ["--json"]):
         assert listed(noisy_session.path, *options) == 2
         assert capsys.readouterr().err.count("\n") == 1
+
+
+@pytest.mark.parametrize(
+    ("name", "stem"),
+    [
+        *(("a.mcap", "a"), ("a.mcap.zst", "a"), ("a.b.bag", "a.b"), ("a.log.gz", "a"), ("a_0.db3", "a_0"), ("a", "a")),
+        ("a.mcap.01234567.part", "a"),
+    ],
+)
+def test_outputs_are_named_after_the_log(name: str, stem: str) -> None:
+    assert log_stem(Path(name)) == stem
