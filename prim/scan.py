@@ -161,12 +161,14 @@ class PosedScan:
         scan: The whole scan.
         pose: The laser's pose in the map frame at the first beam.
         pieces: The scan in parts, each with the laser's pose while it was taken (see :func:`deskew`).
+        scanner: Which of the scanners took it, from 0.
     """
 
     position: int
     scan: Scan
     pose: Pose2D
     pieces: Sequence[tuple[Scan, Pose2D]]
+    scanner: int = 0
 
     @property
     def points(self) -> FloatArray:

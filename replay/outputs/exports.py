@@ -76,7 +76,7 @@ def write_map(stem: Path, grid: OccupancyGrid, force: bool = False) -> None:
 
 
 def write_trajectory(path: Path, result: ReplayResult, force: bool = False) -> None:
-    """Write the laser's poses in TUM's format (stamp x y z qx qy qz qw; s, m).
+    """Write the poses of the laser, of several of the first, in TUM's format (stamp x y z qx qy qz qw; s, m).
 
     Args:
         path: The file.
@@ -88,8 +88,9 @@ def write_trajectory(path: Path, result: ReplayResult, force: bool = False) -> N
         UsageError: There is another file in its place.
     """
     lines = []
-    for stamp, pose, valid in zip(result.stamps.tolist(), result.poses.poses, result.poses.valid, strict=True):
-        if valid:
+    written = result.poses.valid & (result.scanner == 0)
+    for stamp, pose, is_written in zip(result.stamps.tolist(), result.poses.poses, written, strict=True):
+        if is_written:
             x, y, half = pose[0], pose[1], pose[2] / 2
             seconds = f"{stamp // 10**9}.{stamp % 10**9:09d}"
             lines.append(f"{seconds} {x:.9f} {y:.9f} 0 0 0 {np.sin(half):.9f} {np.cos(half):.9f}\n")

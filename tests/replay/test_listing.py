@@ -62,7 +62,14 @@ def test_options_that_do_not_go_with_the_list(noisy_session: Session, capsys: py
 @pytest.mark.parametrize(
     ("name", "stem"),
     [
-        *(("a.mcap", "a"), ("a.mcap.zst", "a"), ("a.b.bag", "a.b"), ("a.log.gz", "a"), ("a_0.db3", "a_0"), ("a", "a")),
+        *(
+            ("a.mcap", "a"),
+            ("a.mcap.zst", "a"),
+            ("a.b.bag", "a.b"),
+            ("a.log.gz", "a"),
+            ("a_0.db3", "a_0"),
+            ("a", "a"),
+        ),
         ("a.mcap.01234567.part", "a"),
     ],
 )
