@@ -47,6 +47,8 @@ def localize(log: LogSource, scans: ScanLog, options: ReplayOptions, timer: Stag
         UsageError: The options do not fit the log.
     """
     found = _look_up_poses(log, scans, options)
+    if found.poses.mount_assumed:
+        found = found._replace(poses=_with_suggested_mount(found.poses, scans, options, timer))
     if not options.match_scans:
         return found
     from replay.poses.scan_matching import match_scans  # when it is needed: a replay without it starts faster
@@ -71,6 +73,19 @@ def pose_scans(scans: ScanLog, poses: LaserPoses, options: ReplayOptions, timer:
         The scans with their poses.
     """
     return PosedScans(scans, poses, PosedScanOptions(options.resolution / 2, options.max_range), timer)
+
+
+def _with_suggested_mount(
+    poses: LaserPoses, scans: ScanLog, options: ReplayOptions, timer: StageTimer
+) -> LaserPoses:
+    """Add a note where the scans agree better with the laser elsewhere on the robot than at its origin."""
+    from replay.poses.mount_estimation import estimate_mount  # when it is needed: a replay without it starts faster
+
+    posed = partial(pose_scans, scans, options=options, timer=timer)
+    estimate = estimate_mount(poses, scans.stamps, posed)
+    if estimate is None or not estimate.is_significant():
+        return poses
+    return replace(poses, notes=(*poses.notes, estimate.note()))
 
 
 def _look_up_poses(log: LogSource, scans: ScanLog, options: ReplayOptions) -> Localization:

@@ -87,6 +87,7 @@ class LaserPoses:
         fusion: The fusion that they come from.
         mounts: The laser's poses (N, 3) on the robot whose poses were fused.
         matched: Whether the poses are corrected by matching the scans with the map.
+        mount_assumed: Whether the laser is only taken to be at the robot's origin: nothing tells its mount.
     """
 
     source: str
@@ -102,6 +103,7 @@ class LaserPoses:
     fusion: Fusion | None = None
     mounts: FloatArray | None = None
     matched: bool = False
+    mount_assumed: bool = False
 
     @property
     def max_std(self) -> tuple[float, float] | None:

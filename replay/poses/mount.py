@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 
@@ -12,6 +13,22 @@ from prim.log.source import LogSource
 from prim.se2 import Pose2D
 from replay.poses.laser_poses import ScanTimes
 from replay.poses.transforms import FIXED_FRAMES, TransformTree, project_to_plane
+
+
+class LaserMounts(NamedTuple):
+    """The laser's pose on the robot at M query stamps.
+
+    Attributes:
+        poses: (M, 3) x, y (m), heading (rad).
+        upside_down: Whether the laser is mounted upside down.
+        notes: What was assumed.
+        assumed: Whether the laser is only taken to be at the robot's origin: nothing tells its mount.
+    """
+
+    poses: FloatArray
+    upside_down: bool
+    notes: tuple[str, ...]
+    assumed: bool
 
 
 class SensorMounts:
@@ -74,7 +91,7 @@ class SensorMounts:
         rotation, translation, _ = tree.lookup(chain, np.zeros(1, dtype=np.int64))
         return rotation[0], translation[0]
 
-    def laser_mounts(self, scans: ScanTimes, base: str) -> tuple[FloatArray, bool, tuple[str, ...]]:
+    def laser_mounts(self, scans: ScanTimes, base: str) -> LaserMounts:
         """Find the laser's pose on the robot at every query stamp.
 
         Args:
@@ -82,7 +99,7 @@ class SensorMounts:
             base: The robot's frame.
 
         Returns:
-            Poses (M, 3), whether the laser is upside down, and notes of what was assumed.
+            Its poses, and what was assumed.
         """
         frame = scans.frame_id.lstrip("/")
         tree, chain = self._chain_to(base, frame)
@@ -92,12 +109,13 @@ class SensorMounts:
         if self._offset is not None:
             mounts[:] = self._offset.x, self._offset.y, self._offset.theta
             notes += (f"--laser-offset stands in for the transform from {base} to {frame}",) * (len(chain) > 1)
-        elif frame != base and len(chain) == 1:
+        assumed = self._offset is None and frame != base and len(chain) == 1
+        if assumed:
             notes += (
                 f"no transform from {base} to {frame or 'the scans, which name no frame'}: the laser is taken to be "
                 "at the robot's origin; if it is not, give --laser-offset X Y DEG",
             )
-        return mounts, upside_down, notes
+        return LaserMounts(mounts, upside_down, notes, assumed)
 
     def _chain_to(self, base: str, frame: str) -> tuple[TransformTree, list[str]]:
         """Return the frames from ``frame`` up to ``base``, and the tree that has them; else the frame alone."""

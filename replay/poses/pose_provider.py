@@ -112,7 +112,7 @@ class PoseProvider:
         Returns:
             The laser's poses, all valid, where the offset or tf puts it.
         """
-        mounts, upside_down, _ = self._mounts.laser_mounts(scans, BASE_FRAME)
+        mounts, upside_down, *_ = self._mounts.laser_mounts(scans, BASE_FRAME)
         valid = np.ones(len(mounts), dtype=bool)
         poses = LaserPoses(STILL, "standing still", mounts, valid, upside_down)
         return _split_end_poses(poses, len(scans.stamps))
@@ -175,9 +175,10 @@ class PoseProvider:
         """Return the robot's poses on a topic, composed with the laser's mount."""
         odometry = read_odometry(self._log, topic)
         robot, valid = odometry.trajectory.at(scans.query_stamps)
-        mounts, upside_down, notes = self._mounts.laser_mounts(scans, odometry.base_frame or BASE_FRAME)
+        mounts, upside_down, notes, assumed = self._mounts.laser_mounts(scans, odometry.base_frame or BASE_FRAME)
         notes += self._gap_note(topic.name, odometry.trajectory.stamps, scans.stamps) + odometry.notes
-        return LaserPoses(source, topic.name, compose_poses(robot, mounts), valid, upside_down, notes)
+        poses = compose_poses(robot, mounts)
+        return LaserPoses(source, topic.name, poses, valid, upside_down, notes, mount_assumed=assumed)
 
     def _from_tf(self, scans: ScanTimes, chain: list[str]) -> LaserPoses:
         tree = self._mounts.tree
@@ -234,7 +235,7 @@ class PoseProvider:
         stamps, first, last = scans.query_stamps, nodes.stamps[0], nodes.stamps[-1]
         at = np.searchsorted(nodes.stamps, np.clip(stamps, first, last))
         robot = estimate.poses[at]
-        mounts, upside_down, notes = self._mounts.laser_mounts(scans, base)
+        mounts, upside_down, notes, assumed = self._mounts.laser_mounts(scans, base)
         if sensors.odometry:
             notes += self._gap_note(sensors.odometry.topic, sensors.odometry.trajectory.stamps, scans.stamps)
         fused_sensors = tuple(_fused_sensors(sensors, estimate))
@@ -250,6 +251,7 @@ class PoseProvider:
             sensors=fused_sensors,
             fusion=fusion,
             mounts=mounts,
+            mount_assumed=assumed,
         )
 
     def _nodes(self, scans: ScanTimes, base: str, sensors: SensorLogs) -> FusionNodes:
