@@ -22,9 +22,9 @@ from numpy.typing import NDArray
 from prim import linear_algebra
 from prim.arrays import FloatArray, Stamps
 from prim.scan import PosedScan
-from prim.se2 import Trajectory, compose_poses, relative_poses, relative_steps, rotate, wrap_angles
+from prim.se2 import Trajectory, compose_poses, relative_poses, relative_steps, rotate, wrap_angle, wrap_angles
 from replay.poses.laser_poses import EXACT_SOURCES, LaserPoses
-from replay.poses.scan_registration import RegistrationOptions, Surfaces, register_pairs
+from replay.poses.scan_registration import PairTerms, RegistrationOptions, Surfaces, register_pairs
 
 Scans = Callable[[LaserPoses], Iterable[PosedScan]]
 """Yields the scans that have a valid pose, with it."""
@@ -103,6 +103,9 @@ class MountEstimationOptions:
     pair_robustness: float = 3.0
     """Pairs lose weight whose residual is larger than this many times the usual one."""
 
+    ridge: float = 1e-3
+    """Added to the information about a pair's residual (1/m^2, 1/rad^2), which may be singular."""
+
     prior_position_std: float = 1.0
     """Standard deviation (m) of a prior around the robot's origin, for what the motion does not tell."""
 
@@ -121,10 +124,10 @@ class MountEstimationOptions:
     heading_floor: float = math.radians(0.05)
     """The same for the heading (rad)."""
 
-    max_position_std: float = 0.02
+    max_position_std: float = 0.03
     """The motion does not tell x or y where its standard deviation (m) is larger."""
 
-    max_heading_std: float = math.radians(1.5)
+    max_heading_std: float = math.radians(3)
     """The motion does not tell the heading where its standard deviation (rad) is larger."""
 
     significance: float = 3.0
@@ -199,7 +202,10 @@ def estimate_mount(
         The estimate; None where the motion or the scans do not tell anything.
     """
     pairs = _ScanPairs.choose(poses, stamps, source, options)
-    return None if pairs is None else MountEstimator(pairs, options).run()
+    if pairs is None:
+        return None
+    with np.errstate(all="ignore"):  # what overflows is not finite, and then nothing is told
+        return MountEstimator(pairs, options).run()
 
 
 @dataclass(frozen=True)
@@ -212,7 +218,7 @@ class _ScanPairs:
         steps: (P, 3) the robot's pose at the second scan relative to that at the first.
         later: (P, 3) the same where the poses' clock is late by ``timing_std``.
         travel: (P,) distance travelled in between (m), for the errors of the poses.
-        blocks: (P, 2) the stretches of the path that the scans lie on.
+        span: (P, 2) where on the path the scans lie, from 0 to 1.
     """
 
     surfaces: Surfaces
@@ -220,7 +226,7 @@ class _ScanPairs:
     steps: FloatArray
     later: FloatArray
     travel: FloatArray
-    blocks: NDArray[np.int64]
+    span: FloatArray
 
     @classmethod
     def choose(
@@ -256,11 +262,11 @@ class _ScanPairs:
             relative_poses(robot[a], robot[b]),
             relative_poses(robot[a] + late[a], robot[b] + late[b]),
             np.maximum(drift[b] - drift[a], np.finfo(float).tiny),
-            np.minimum(travel[chosen] / travel[-1] * options.blocks, options.blocks - 1).astype(np.int64),
+            travel[chosen] / travel[-1],
         )
 
     def predicted(self, mount: FloatArray, steps: FloatArray | None = None) -> FloatArray:
-        """Return the laser's poses (P, 3) at the second scans relative to those at the first, by the robot's motion."""
+        """Return the laser's poses (P, 3) at the second scans relative to the first ones, by the robot's motion."""
         steps = self.steps if steps is None else steps
         mounts = np.broadcast_to(mount, steps.shape)
         return relative_poses(mounts, compose_poses(steps, mounts))
@@ -279,6 +285,26 @@ class _ScanPairs:
         by_step[:, :2, 2] = np.column_stack((-lever[:, 1], lever[:, 0])) @ back.T
         by_step[:, 2, 2] = 1.0
         return by_mount, by_step
+
+    def registered(
+        self, mount: FloatArray, relative: FloatArray, std: float, distance: float, options: MountEstimationOptions
+    ) -> PairTerms:
+        """Return how well the scans fit at the lasers' relative poses (P, 3); see :func:`register_pairs`."""
+        points = self.surfaces.in_laser_frame(mount)
+        return register_pairs(points, self.surfaces.starts, self.scans, relative, std, distance, options.registration)
+
+    def thinned(self, count: int) -> _ScanPairs:
+        """Return at most ``count`` of the pairs, evenly spread, with half of the scans' points."""
+        stride = max(1, -(-len(self.scans) // count))
+        return replace(
+            self,
+            surfaces=self.surfaces.thinned(2),
+            scans=self.scans[::stride],
+            steps=self.steps[::stride],
+            later=self.later[::stride],
+            travel=self.travel[::stride],
+            span=self.span[::stride],
+        )
 
     def step_covariances(self, drift: tuple[float, float]) -> FloatArray:
         """Return the covariances (P, 3, 3) of the steps by the variances (m^2, rad^2) of their errors after 1 m.
@@ -307,6 +333,12 @@ def _spread_pairs(travel: FloatArray, options: MountEstimationOptions) -> NDArra
     return np.unique(pairs[pairs[:, 1] < len(travel)], axis=0)
 
 
+def _multiply(matrices: linear_algebra.Matrix, vectors: FloatArray) -> FloatArray:
+    """Return the products (P, 3) of matrices (P, 3, 3) and vectors (P, 3)."""
+    product: FloatArray = np.einsum("pab,pb->pa", matrices, vectors)
+    return product
+
+
 def _wrapped(poses: FloatArray) -> FloatArray:
     """Return differences (N, 3) of poses with headings within half a turn."""
     return np.column_stack((poses[:, :2], wrap_angles(poses[:, 2])))
@@ -317,14 +349,53 @@ class _Linearization:
     """The negative log-likelihood of the mount to second order, by pairs.
 
     Attributes:
-        gradients: (P, 3).
-        information: (P, 3, 3).
-        by_relative: (P, 3, 3) derivatives of the gradients by the laser's relative poses.
+        relative: (P, 3) the lasers' relative poses Z that the scans were registered at.
+        by_mount: (P, 3, 3) derivatives of the prediction of Z by the mount.
+        by_step: (P, 3, 3) its derivatives by the robot's step.
+        scan_gradients: (P, 3) of the scans' negative log-likelihood with respect to Z.
+        covariances: (P, 3, 3) of the prediction of Z, C.
+        inverses: (P, 3, 3) of I + L C, where L is the scans' information about Z.
+        weights: (P, 3, 3) the information W = (L^-1 + C)^-1 of Z's residual.
+        pulls: (P, 3) derivatives of the negative log-likelihood by the prediction of Z.
+        robust: (P,) weights of the pairs.
     """
 
-    gradients: FloatArray
-    information: FloatArray
-    by_relative: FloatArray
+    relative: FloatArray
+    by_mount: FloatArray
+    by_step: FloatArray
+    scan_gradients: FloatArray
+    covariances: FloatArray
+    inverses: FloatArray
+    weights: FloatArray
+    pulls: FloatArray
+    robust: FloatArray
+
+    @property
+    def gradients(self) -> FloatArray:
+        """The gradients (P, 3) with respect to the mount."""
+        return self.robust[:, None] * _multiply(self.by_mount.transpose(0, 2, 1), self.pulls)
+
+    @property
+    def by_relative(self) -> FloatArray:
+        """The derivatives (P, 3, 3) of the gradients by the prediction of Z."""
+        return self.robust[:, None, None] * (self.by_mount.transpose(0, 2, 1) @ self.weights)
+
+    @property
+    def information(self) -> FloatArray:
+        """The information (P, 3, 3) about the mount."""
+        return self.by_relative @ self.by_mount
+
+    @property
+    def totals(self) -> tuple[FloatArray, FloatArray]:
+        """The gradient (3,) and the information (3, 3) of all pairs."""
+        return self.gradients.sum(axis=0), self.information.sum(axis=0)
+
+    def posterior(self, predicted: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Return Z by the scans and by a prediction (P, 3), its difference from this, and its covariance."""
+        off = _wrapped(predicted - self.relative)
+        towards = off - _multiply(self.covariances, self.scan_gradients)
+        relative = self.relative + _multiply(self.inverses.transpose(0, 2, 1), towards)
+        return relative, _wrapped(relative - predicted), self.covariances @ self.inverses
 
 
 class MountEstimator:
@@ -346,128 +417,137 @@ class MountEstimator:
         free, std = np.ones(3, dtype=bool), np.zeros(3)
         while free.any():
             mount, covariance = self._estimate(free)
-            std[free] = np.sqrt(np.diagonal(covariance))
-            excess = np.where(free, std / limits, 0.0)
+            std = np.where(free, np.sqrt(np.diagonal(covariance)), 0.0)
+            excess = std / limits
+            if not np.isfinite(excess).all():
+                return None
             if excess.max() <= 1:
-                return MountEstimate(np.where(free, mount, 0.0), std, free)
+                return MountEstimate(mount, std, free)
             free[np.argmax(excess)] = False
         return None
 
     def _estimate(self, free: NDArray[np.bool_]) -> tuple[FloatArray, FloatArray]:
-        """Return the mount (3,), with the components that are not free at 0, and the covariance of the free ones."""
+        """Return the mount (3,), with the components that are not free at 0, and its covariance (3, 3)."""
+        options = self._options
         mount = self._search(free)
-        relative, options = self._pairs.predicted(mount), self._options
-        drift = options.drift_position_std**2, options.drift_heading_std**2
-        std = options.first_std
+        relative = self._pairs.predicted(mount)
+        start = options.drift_position_std**2, options.drift_heading_std**2
+        drift, std = start, options.first_std
         for step in range(options.steps):
             std = max(std * options.std_decay, options.final_std)
-            mount, relative, drift, linear = self._refine(mount, relative, drift, std, free)
-            if step < options.drift_from_step:
-                drift = options.drift_position_std**2, options.drift_heading_std**2
+            linear = self._linearized(mount, relative, drift, std)
+            mount = mount + self._step(*linear.totals, mount, free)
+            relative, errors, covariances = linear.posterior(self._pairs.predicted(mount))
+            if step >= options.drift_from_step:
+                drift = self._drift(errors, covariances, linear)
         return mount, self._covariance(mount, linear, free)
 
     def _search(self, free: NDArray[np.bool_]) -> FloatArray:
         """Return the best mount (3,) of coarse registrations from several headings."""
         options = self._options
-        thinned = self._pairs.surfaces.thinned(2)
-        stride = max(1, -(-len(self._pairs.scans) // options.coarse_pairs))
-        some = replace(self._pairs, surfaces=thinned, **{
-            name: getattr(self._pairs, name)[::stride] for name in ("scans", "steps", "later", "travel", "blocks")
-        })
-        headings = np.arange(options.start_headings if free[2] else 1) * 2 * np.pi / options.start_headings
-        found = [self._descend(some, np.array([0.0, 0.0, heading]), free) for heading in headings.tolist()]
-        best = min(found, key=lambda result: result[1])
-        mount = best[0] if best[1] < (1 - options.min_gain) * found[0][1] else found[0][0]
-        return np.array([*mount[:2], wrap_angles(mount[2])])
+        some = self._pairs.thinned(options.coarse_pairs)
+        count = options.start_headings if free[2] else 1
+        headings = np.linspace(0, 2 * np.pi, count, endpoint=False).tolist()
+        found = [self._descend(some, np.array([0.0, 0.0, heading]), free) for heading in headings]
+        usual, best = found[0], min(found, key=lambda result: result[1])
+        mount = best[0] if best[1] < (1 - options.min_gain) * usual[1] else usual[0]
+        return np.array([mount[0], mount[1], wrap_angle(float(mount[2]))])
 
-    def _descend(self, pairs, mount, free):
-        options = self._options
+    def _descend(self, pairs: _ScanPairs, mount: FloatArray, free: NDArray[np.bool_]) -> tuple[FloatArray, float]:
+        """Return the mount (3,) that is reached from this one by exact poses, and the mean misfit of a point."""
+        options, misfit = self._options, math.inf
         for _ in range(options.coarse_steps):
-            fit = register_pairs(pairs.surfaces, pairs.surfaces.in_laser_frame(mount), pairs.scans,
-                pairs.predicted(mount), options.coarse_std, options.coarse_distance, options.registration)
+            fit = pairs.registered(
+                mount, pairs.predicted(mount), options.coarse_std, options.coarse_distance, options
+            )
             by_mount, _ = pairs.jacobians(mount)
             gradient = np.einsum("pai,pa->i", by_mount, fit.gradients)
             information = np.einsum("pai,pab,pbj->ij", by_mount, fit.information, by_mount)
             mount = mount + self._step(gradient, information, mount, free)
-        return mount, float(fit.misfit.sum() / max(fit.points.sum(), 1.0))
+            misfit = float(fit.misfit.sum() / max(fit.points.sum(), 1.0))
+        return mount, misfit
 
-    def _step(self, gradient, information, mount, free):
-        """Return the step (3,) of Gauss and Newton that the free components take."""
-        at = np.flatnonzero(free)
-        matrix = (information + self._prior)[np.ix_(at, at)]
-        away = np.array([*mount[:2], wrap_angles(mount[2])])
-        solved = linear_algebra.solve(matrix, -(gradient + self._prior @ away)[at])
-        step = np.zeros(3)
-        if solved is not None:
-            step[at] = solved
+    def _step(
+        self, gradient: FloatArray, information: FloatArray, mount: FloatArray, free: NDArray[np.bool_]
+    ) -> FloatArray:
+        """Return the step (3,) of Gauss and Newton, 0 for components that are not free."""
+        step, at = np.zeros(3), np.flatnonzero(free)
+        centred = np.array([mount[0], mount[1], wrap_angle(float(mount[2]))])
+        total = (gradient + self._prior @ centred)[at]
+        solution = linear_algebra.solve((information + self._prior)[np.ix_(at, at)], -total)
+        if solution is not None:
+            step[at] = solution
         return step
 
-    def _refine(self, mount, relative, drift, std, free):
+    def _linearized(
+        self, mount: FloatArray, relative: FloatArray, drift: tuple[float, float], std: float
+    ) -> _Linearization:
+        """Return the negative log-likelihood of the mount to second order at the lasers' relative poses (P, 3)."""
         options, pairs = self._options, self._pairs
         distance = max(options.distance_stds * std, options.min_distance)
-        fit = register_pairs(pairs.surfaces, pairs.surfaces.in_laser_frame(mount), pairs.scans, relative, std, distance, options.registration)
+        fit = pairs.registered(mount, relative, std, distance, options)
         by_mount, by_step = pairs.jacobians(mount)
         covariances = by_step @ pairs.step_covariances(drift) @ by_step.transpose(0, 2, 1)
-        off = _wrapped(pairs.predicted(mount) - relative)
-        # with information L of the scans and covariance C of the motion: (I + L C)^-1 L is (L^-1 + C)^-1
-        mixing = np.eye(3) + fit.information @ covariances
-        inverse = np.linalg.inv(mixing)
-        weights = inverse @ fit.information
-        pull = np.einsum("pab,pb->pa", weights, off) + np.einsum("pab,pb->pa", inverse, fit.gradients)
-        robust = self._pair_weights(pull, weights)
-        linear = _Linearization(
-            robust[:, None] * np.einsum("pai,pa->pi", by_mount, pull),
-            robust[:, None, None] * (by_mount.transpose(0, 2, 1) @ weights @ by_mount),
-            robust[:, None, None] * (by_mount.transpose(0, 2, 1) @ weights),
-        )
-        mount = mount + self._step(linear.gradients.sum(axis=0), linear.information.sum(axis=0), mount, free)
-        off = _wrapped(pairs.predicted(mount) - relative)
-        moved = off - np.einsum("pab,pb->pa", covariances, fit.gradients)
-        relative = relative + np.einsum("pba,pb->pa", inverse, moved)
-        posterior = covariances @ inverse
-        errors = _wrapped(relative - pairs.predicted(mount))
-        return mount, relative, self._drift(errors, posterior, by_step, robust), linear
+        # with the scans' information L and the motion's covariance C, (I + L C)^-1 L is (L^-1 + C)^-1 for any L
+        inverses: FloatArray = np.linalg.inv(np.eye(3) + fit.information @ covariances)
+        weights: FloatArray = inverses @ fit.information
+        pulls = _multiply(weights, _wrapped(pairs.predicted(mount) - relative)) + _multiply(inverses, fit.gradients)
+        return _Linearization(
+            relative, by_mount, by_step, fit.gradients, covariances, inverses, weights, pulls,
+            _pair_weights(pulls, weights, options),
+        )  # fmt: skip
 
-    def _pair_weights(self, pull, weights):
-        """Return the robust weights (P,) of pairs, by the squared Mahalanobis distances of their residuals."""
-        # pull is W d for a residual d: d^T W d = pull^T W^-1 pull; W is singular where a pair's scans do not tell
-        # all of Z, and the directions that they do not tell have no pull
-        ridge = np.eye(3)*1e-3
-        distance = np.einsum("pa,pa->p", pull, np.linalg.solve(weights + ridge, pull[..., None])[..., 0])
-        usual = max(float(np.median(distance)), np.finfo(float).tiny)
-        return (1 + distance / (usual * self._options.pair_robustness**2)) ** -2
+    def _drift(self, errors: FloatArray, covariances: FloatArray, linear: _Linearization) -> tuple[float, float]:
+        """Return the variances (m^2, rad^2) of the motion's errors after one metre: the M step of EM.
 
-    def _drift(self, errors, posterior, by_step, robust):
-        """Return the variances (m^2, rad^2) of the steps' errors after one metre: the M step of EM."""
-        back = np.linalg.inv(by_step)
-        errors = np.einsum("pab,pb->pa", back, errors)
-        posterior = back @ posterior @ back.transpose(0, 2, 1)
-        # the error of position less the mean effect of that of heading
-        split = np.zeros((len(errors), 3, 3))
-        split[:] = np.eye(3)
+        Args:
+            errors: (P, 3) of the lasers' relative poses by the motion.
+            covariances: (P, 3, 3) of these, as they are only estimated.
+            linear: What they come from.
+        """
+        # errors of the robot's steps; that of position less the mean effect of that of heading
+        split = np.tile(np.eye(3), (len(errors), 1, 1))
         split[:, :2, 2] = -self._pairs.across / 2
-        errors = np.einsum("pab,pb->pa", split, errors)
-        squares = errors**2 + np.diagonal(split @ posterior @ split.transpose(0, 2, 1), axis1=1, axis2=2)
-        x, y, theta = (robust[:, None] * squares / self._pairs.travel[:, None]).sum(axis=0) / robust.sum()
+        split = split @ np.linalg.inv(linear.by_step)
+        variances = np.diagonal(split @ covariances @ split.transpose(0, 2, 1), axis1=1, axis2=2)
+        squares = (_multiply(split, errors) ** 2 + variances) / self._pairs.travel[:, None]
+        x, y, heading = (linear.robust @ squares / linear.robust.sum()).tolist()
         least = self._options.min_drift_variance
-        return max((x + y) / 2, least), max(theta, least)
+        return max((x + y) / 2, least), max(heading, least)
 
-    def _covariance(self, mount, linear, free):
-        at = np.flatnonzero(free)
-        options, pairs = self._options, self._pairs
-        gradient, information = linear.gradients[:, at], linear.information[:, at][:, :, at]
+    def _covariance(self, mount: FloatArray, linear: _Linearization, free: NDArray[np.bool_]) -> FloatArray:
+        """Return the covariance (3, 3) of the estimate; 0 for components that are not free.
+
+        It is the sum of what leaving out stretches of the path shows (block jackknife: errors of neighbouring pairs
+        are not independent), what the residuals' own noise and the prior give, of an error of the clocks, and of
+        what the model does not describe.
+        """
+        options, pairs, at = self._options, self._pairs, np.flatnonzero(free)
+        gradients, information = linear.gradients[:, at], linear.information[:, at][:, :, at]
         prior = self._prior[np.ix_(at, at)]
         model = np.linalg.inv(information.sum(axis=0) + prior)
-        replicates = []
-        for block in range(options.blocks):
-            kept = (pairs.blocks[:, 1] < block) | (pairs.blocks[:, 0] > block)
-            if not kept.all():
-                replicates.append(-np.linalg.solve(information[kept].sum(axis=0) + prior, gradient[kept].sum(axis=0)))
-        count = len(replicates)
-        off = np.array(replicates) - np.mean(replicates, axis=0)
-        jackknife = (count - 1) / count * off.T @ off
+        blocks = np.minimum(pairs.span * options.blocks, options.blocks - 1).astype(np.int64)
+        kept = [(blocks[:, 1] < block) | (blocks[:, 0] > block) for block in range(options.blocks)]
+        replicates = np.array(
+            [np.linalg.solve(information[k].sum(axis=0) + prior, gradients[k].sum(axis=0)) for k in kept]
+        )
+        off = replicates - replicates.mean(axis=0)
+        jackknife = (options.blocks - 1) / options.blocks * off.T @ off
         late = _wrapped(pairs.predicted(mount, pairs.later) - pairs.predicted(mount))
-        shift = model @ np.einsum("pia,pa->i", linear.by_relative, late)[at]
-        floor = np.diag(np.array([options.position_floor, options.position_floor, options.heading_floor])[at] ** 2)
-        self.parts = tuple(np.sqrt(np.diagonal(m)) for m in (jackknife, model, np.outer(shift, shift)))
-        return jackknife + model + np.outer(shift, shift) + floor
+        shift = model @ _multiply(linear.by_relative, late).sum(axis=0)[at]
+        floor = np.array([options.position_floor, options.position_floor, options.heading_floor])[at]
+        covariance = np.zeros((3, 3))
+        covariance[np.ix_(at, at)] = jackknife + model + np.outer(shift, shift) + np.diag(floor**2)
+        return covariance
+
+
+def _pair_weights(pulls: FloatArray, weights: FloatArray, options: MountEstimationOptions) -> FloatArray:
+    """Return the robust weights (P,) of pairs, by the squared Mahalanobis distances of their residuals.
+
+    A pull is W d, with the weight W and the residual d, which may be anything where W is singular.
+    """
+    residuals = np.linalg.solve(weights + options.ridge * np.eye(3), pulls[:, :, None])[:, :, 0]
+    distances = np.maximum((pulls * residuals).sum(axis=1), 0.0)
+    usual = max(float(np.median(distances)), np.finfo(float).tiny)
+    robust: FloatArray = (1 + distances / (usual * options.pair_robustness**2)) ** -2
+    return robust

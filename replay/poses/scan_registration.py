@@ -12,7 +12,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -203,8 +203,8 @@ class PairTerms(NamedTuple):
 
 
 def register_pairs(
-    surfaces: Surfaces,
     points: FloatArray,
+    starts: NDArray[np.int64],
     pairs: NDArray[np.int64],
     relative: FloatArray,
     std: float,
@@ -214,8 +214,8 @@ def register_pairs(
     """Evaluate how well pairs of scans fit.
 
     Args:
-        surfaces: The scans' surfaces.
-        points: (N, 4) their points and normals in the lasers' frames, see :meth:`Surfaces.in_laser_frame`.
+        points: (N, 4) the scans' points and normals, see :meth:`Surfaces.in_laser_frame`.
+        starts: (S + 1,) where each scan's points begin.
         pairs: (P, 2) indices of scans.
         relative: (P, 3) pose of each second scan's laser in the frame of the first one's.
         std: Standard deviation of the residuals (m).
@@ -227,12 +227,12 @@ def register_pairs(
     """
     result = np.zeros((len(pairs), 11))
     limits = max_distance, std, options.min_cosine, options.robustness
-    _register(points, surfaces.starts, pairs, relative, limits, result)
+    _register(points, starts, pairs, relative, limits, result)
     return PairTerms(result[:, :3], unpack_symmetric(result[:, 3:9]), result[:, 9], result[:, 10])
 
 
 @inline
-def _nearest(points, x, y, max_distance):  # type: ignore[no-untyped-def]
+def _nearest(points: Any, x: float, y: float, max_distance: float) -> int:
     """Return the index of the point (N, 2) nearest to x, y; -1 where none is within the distance."""
     best, nearest = max_distance * max_distance, -1
     for k in range(len(points)):
@@ -243,7 +243,7 @@ def _nearest(points, x, y, max_distance):  # type: ignore[no-untyped-def]
 
 
 @inline
-def _add_residual(first, a, second, b, x, y, limits, sums):  # type: ignore[no-untyped-def]
+def _add_residual(first: Any, a: int, second: Any, b: int, x: float, y: float, limits: Any, sums: Any) -> None:
     """Add the residual of two points that correspond, of which the second's is in the first scan's frame."""
     _, std, min_cosine, robustness = limits
     sums[10] += 1.0
@@ -271,7 +271,7 @@ def _add_residual(first, a, second, b, x, y, limits, sums):  # type: ignore[no-u
 
 
 @kernel
-def _register(points, starts, pairs, relative, limits, result):  # type: ignore[no-untyped-def]
+def _register(points: Any, starts: Any, pairs: Any, relative: Any, limits: Any, result: Any) -> None:
     """Add up the terms of each pair; see :func:`register_pairs`."""
     max_distance = limits[0]
     for pair in range(len(pairs)):
