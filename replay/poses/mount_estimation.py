@@ -167,24 +167,24 @@ class MountEstimate:
 
     def note(self) -> str:
         """Return what the scans suggest, with the option that takes it."""
-        x, y, heading = (float(value) for value in (*self.mount[:2], math.degrees(self.mount[2])))
-        x, y, heading = round(x, 3) + 0.0, round(y, 3) + 0.0, round(heading, 1) + 0.0  # + 0.0: no -0
-        std = (*self.std[:2].tolist(), math.degrees(self.std[2]))
-        parts = [
-            f"{name} {value:.{digits}f} ± {max(error, 0.1**digits):.{digits}f}{unit}"
-            for name, value, error, digits, unit, told in (
-                ("x", x, std[0], 3, " m", self.told[0]),
-                ("y", y, std[1], 3, " m", self.told[1]),
-                ("heading", heading, std[2], 1, " degrees", self.told[2]),
-            )
-            if told
+        shown = [
+            _rounded(float(self.mount[0]), float(self.std[0]), 3),
+            _rounded(float(self.mount[1]), float(self.std[1]), 3),
+            _rounded(math.degrees(self.mount[2]), math.degrees(self.std[2]), 1),
         ]
-        untold = [name for name, told in zip(("x", "y", "heading"), self.told, strict=True) if not told]
-        rest = f" (the motion does not determine {' and '.join(untold)}: 0 is assumed)" if untold else ""
+        names, units = ("x", "y", "heading"), ("m", "m", "degrees")
+        told = [f"{names[k]} {' ± '.join(shown[k])} {units[k]}" for k in range(3) if self.told[k]]
+        untold = [names[k] for k in range(3) if not self.told[k]]
+        taken = f" (the motion does not determine {' and '.join(untold)}: 0 is assumed)" if untold else ""
         return (
-            f"the scans agree best with the laser at {', '.join(parts)} on the robot{rest}; "
-            f"to use it: --laser-offset {x:.3f} {y:.3f} {heading:.1f}"
+            f"the scans agree best with the laser at {', '.join(told)} on the robot{taken}; to use it: "
+            f"--laser-offset {' '.join(value for value, _ in shown)}"
         )
+
+
+def _rounded(value: float, std: float, digits: int) -> tuple[str, str]:
+    """Return a value and its standard deviation as text; the latter is never shown as 0, the former never as -0."""
+    return f"{round(value, digits) + 0.0:.{digits}f}", f"{max(std, 10.0**-digits):.{digits}f}"
 
 
 def estimate_mount(
@@ -489,8 +489,8 @@ class MountEstimator:
         by_mount, by_step = pairs.jacobians(mount)
         covariances = by_step @ pairs.step_covariances(drift) @ by_step.transpose(0, 2, 1)
         # with the scans' information L and the motion's covariance C, (I + L C)^-1 L is (L^-1 + C)^-1 for any L
-        inverses: FloatArray = np.linalg.inv(np.eye(3) + fit.information @ covariances)
-        weights: FloatArray = inverses @ fit.information
+        inverses = np.asarray(np.linalg.inv(np.eye(3) + fit.information @ covariances), dtype=float)
+        weights = inverses @ fit.information
         pulls = _multiply(weights, _wrapped(pairs.predicted(mount) - relative)) + _multiply(inverses, fit.gradients)
         return _Linearization(
             relative, by_mount, by_step, fit.gradients, covariances, inverses, weights, pulls,
