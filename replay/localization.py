@@ -75,9 +75,7 @@ def pose_scans(scans: ScanLog, poses: LaserPoses, options: ReplayOptions, timer:
     return PosedScans(scans, poses, PosedScanOptions(options.resolution / 2, options.max_range), timer)
 
 
-def _with_suggested_mount(
-    poses: LaserPoses, scans: ScanLog, options: ReplayOptions, timer: StageTimer
-) -> LaserPoses:
+def _with_suggested_mount(poses: LaserPoses, scans: ScanLog, options: ReplayOptions, timer: StageTimer) -> LaserPoses:
     """Add a note where the scans agree better with the laser elsewhere on the robot than at its origin."""
     from replay.poses.mount_estimation import estimate_mount  # when it is needed: a replay without it starts faster
 

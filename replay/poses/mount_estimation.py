@@ -37,7 +37,7 @@ class MountEstimationOptions:
     anchors: int = 120
     """Number of scans, evenly spread over the robot's path, that others are paired with."""
 
-    separations: tuple[float, ...] = (0.25, 0.5, 1.0, 2.0)
+    separations: tuple[float, ...] = (0.5, 1.0, 2.0, 4.0)
     """Each of them is paired with the scans that follow at these distances travelled (m), path and turns."""
 
     turn_radius: float = 0.5
@@ -55,7 +55,7 @@ class MountEstimationOptions:
     start_headings: int = 8
     """The search starts from so many headings of the laser, evenly spread from 0 on."""
 
-    min_gain: float = 0.05
+    min_start_gain: float = 0.05
     """Another start is preferred to heading 0 where the misfit is lower by this share."""
 
     coarse_pairs: int = 120
@@ -79,7 +79,7 @@ class MountEstimationOptions:
     std_decay: float = 0.75
     """It is multiplied by this from one step to the next, down to ``final_std``."""
 
-    final_std: float = 0.012
+    final_std: float = 0.02
     """Standard deviation of residuals (m) in the last steps."""
 
     distance_stds: float = 6.0
@@ -139,6 +139,10 @@ class MountEstimationOptions:
     min_heading: float = math.radians(0.3)
     """... or this (rad)."""
 
+    min_misfit_gain: float = 0.01
+    """The laser is taken to be elsewhere only where that lowers the misfit of the scans by this share: where poses
+    have errors that the model does not describe, it does not."""
+
     registration: RegistrationOptions = field(default_factory=RegistrationOptions)
 
 
@@ -153,17 +157,19 @@ class MountEstimate:
         mount: (3,) x, y (m), heading (rad); 0 where the motion does not tell it.
         std: (3,) standard deviations (m, rad).
         told: (3,) whether the motion tells the component.
+        gain: The share by which the misfit of the scans is lower than with the laser at the robot's origin.
     """
 
     mount: FloatArray
     std: FloatArray
     told: NDArray[np.bool_]
+    gain: float
 
     def is_significant(self, options: MountEstimationOptions = DEFAULTS) -> bool:
-        """Return whether the laser is not at the robot's origin, as far as the motion tells."""
+        """Return whether the laser is elsewhere than at the robot's origin, as far as the motion tells."""
         least = np.array([options.min_position, options.min_position, options.min_heading])
         threshold = np.maximum(options.significance * self.std, least)
-        return bool((self.told & (np.abs(self.mount) > threshold)).any())
+        return bool((self.told & (np.abs(self.mount) > threshold)).any()) and self.gain >= options.min_misfit_gain
 
     def note(self) -> str:
         """Return what the scans suggest, with the option that takes it."""
@@ -422,7 +428,8 @@ class MountEstimator:
             if not np.isfinite(excess).all():
                 return None
             if excess.max() <= 1:
-                return MountEstimate(mount, std, free)
+                gain = 1 - self._misfit(mount) / max(self._misfit(np.zeros(3)), np.finfo(float).tiny)
+                return MountEstimate(mount, std, free, gain)
             free[np.argmax(excess)] = False
         return None
 
@@ -450,7 +457,7 @@ class MountEstimator:
         headings = np.linspace(0, 2 * np.pi, count, endpoint=False).tolist()
         found = [self._descend(some, np.array([0.0, 0.0, heading]), free) for heading in headings]
         usual, best = found[0], min(found, key=lambda result: result[1])
-        mount = best[0] if best[1] < (1 - options.min_gain) * usual[1] else usual[0]
+        mount = best[0] if best[1] < (1 - options.min_start_gain) * usual[1] else usual[0]
         return np.array([mount[0], mount[1], wrap_angle(float(mount[2]))])
 
     def _descend(self, pairs: _ScanPairs, mount: FloatArray, free: NDArray[np.bool_]) -> tuple[FloatArray, float]:
@@ -466,6 +473,14 @@ class MountEstimator:
             mount = mount + self._step(gradient, information, mount, free)
             misfit = float(fit.misfit.sum() / max(fit.points.sum(), 1.0))
         return mount, misfit
+
+    def _misfit(self, mount: FloatArray) -> float:
+        """Return the scans' misfit where the poses are exact and the laser is mounted here."""
+        options, pairs = self._options, self._pairs
+        distance = options.distance_stds * options.final_std
+        return float(
+            pairs.registered(mount, pairs.predicted(mount), options.final_std, distance, options).misfit.sum()
+        )
 
     def _step(
         self, gradient: FloatArray, information: FloatArray, mount: FloatArray, free: NDArray[np.bool_]

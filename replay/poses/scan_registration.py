@@ -38,8 +38,8 @@ class RegistrationOptions:
     min_neighbours: int = 2
     """A line is fitted to at least so many beams on either side."""
 
-    max_neighbours: int = 10
-    """A line is fitted to at most so many beams on either side."""
+    max_neighbours: int = 4
+    """A line is fitted to at most so many beams on either side: more of them blur what is no line."""
 
     max_slope: float = 4.0
     """Surfaces that a beam meets at a larger tangent of its angle of incidence are left out."""

@@ -145,6 +145,13 @@ def test_scans_that_show_nothing_tell_nothing() -> None:
     assert drive.estimate() is None
 
 
+def test_poses_that_have_nothing_to_do_with_the_scans_suggest_nothing() -> None:
+    drive = Drive(winding(), Pose2D())
+    drive.robot = winding() + np.cumsum(np.random.default_rng(1).normal(0, 0.05, (150, 3)), axis=0)
+    found = drive.estimate()
+    assert found is None or not found.is_significant()
+
+
 def test_only_the_scans_that_are_paired_are_asked_for() -> None:
     """Else a long log would not fit into memory."""
     drive, asked = Drive(winding(60), OFF), []
@@ -181,7 +188,7 @@ def test_surface_points_lie_on_walls_and_their_normals_point_at_the_laser(make_s
     assert range_noise([scan]) == pytest.approx(0.02, rel=0.4)
     assert len(points) > 60 and 50 not in beams
     assert points[:, 0] == pytest.approx(2.0, abs=0.04) and points[:, 0].std() < 0.015
-    assert (points[:, 2] < -0.9).all()
+    assert (points[:, 2] < -0.7).all() and (points[:, 2].mean() < -0.95)
 
 
 def test_the_gradient_of_the_registration_points_away_from_the_true_pose() -> None:
@@ -198,7 +205,9 @@ def test_the_gradient_of_the_registration_points_away_from_the_true_pose() -> No
 
 
 def test_the_notes_wording() -> None:
-    found = MountEstimate(np.array([-0.0321, -0.0001, 0.0]), np.array([0.001, 1e-4, 1e-4]), np.ones(3, dtype=bool))
+    found = MountEstimate(
+        np.array([-0.0321, -0.0001, 0.0]), np.array([0.001, 1e-4, 1e-4]), np.ones(3, dtype=bool), 0.1
+    )
     assert found.note() == (
         "the scans agree best with the laser at x -0.032 ± 0.001 m, y 0.000 ± 0.001 m, heading 0.0 ± 0.1 degrees on "
         "the robot; to use it: --laser-offset -0.032 0.000 0.0"
@@ -308,13 +317,11 @@ def random_mount(seed: int) -> Pose2D:
 def test_twenty_sessions_by_exact_poses(tmp_path: Path, motion: str) -> None:
     """Within 5 mm and 0.2 degrees; and no suggestion from the same sessions with the laser at the origin."""
     off, std = [], []
-    for seed in range(100, 120):
+    for seed in range(200, 220):
         options = {"motion": motion, "rate": 5.0, "explorer": ExplorerOptions(margin=0.18)}
-        found, mount = (
-            estimate_of(recorded(tmp_path, seed, random_mount(seed), **options), "truth"),
-            random_mount(seed),
-        )
-        assert found.told.all()
+        mount = random_mount(seed)
+        found = estimate_of(recorded(tmp_path, seed, mount, **options), "truth")
+        assert found.told.all() and found.is_significant()
         off.append(errors(found, mount))
         std.append(found.std)
         centred = estimate_of(recorded(tmp_path, 1000 + seed, Pose2D(), **options), "truth")
@@ -329,7 +336,7 @@ def test_twenty_sessions_by_exact_poses(tmp_path: Path, motion: str) -> None:
 def test_standard_deviations_by_odometry_that_drifts(tmp_path: Path, translation: float, rotation: float) -> None:
     """Close to 95 % of the errors are within two standard deviations, and these are not much too large."""
     ratios = []
-    for seed in range(100, 120):
+    for seed in range(200, 220):
         noise, explorer = OdometryNoise(translation, math.radians(rotation)), ExplorerOptions(margin=0.18)
         options = {"motion": "drive", "rate": 5.0, "odometry": noise, "explorer": explorer}
         path, mount = recorded(tmp_path, seed, random_mount(seed), **options), random_mount(seed)
