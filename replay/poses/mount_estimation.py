@@ -339,6 +339,12 @@ def _spread_pairs(travel: FloatArray, options: MountEstimationOptions) -> NDArra
     return np.unique(pairs[pairs[:, 1] < len(travel)], axis=0)
 
 
+def _inverses(matrices: linear_algebra.Matrix) -> FloatArray:
+    """Return the inverses (P, K, K) of matrices; NaN where one is singular: then nothing is told."""
+    inverses = linear_algebra.solve(matrices, np.broadcast_to(np.eye(matrices.shape[1]), matrices.shape))
+    return np.full(matrices.shape, np.nan) if inverses is None else inverses
+
+
 def _multiply(matrices: linear_algebra.Matrix, vectors: FloatArray) -> FloatArray:
     """Return the products (P, 3) of matrices (P, 3, 3) and vectors (P, 3)."""
     product: FloatArray = np.einsum("pab,pb->pa", matrices, vectors)
@@ -504,7 +510,7 @@ class MountEstimator:
         by_mount, by_step = pairs.jacobians(mount)
         covariances = by_step @ pairs.step_covariances(drift) @ by_step.transpose(0, 2, 1)
         # with the scans' information L and the motion's covariance C, (I + L C)^-1 L is (L^-1 + C)^-1 for any L
-        inverses = np.asarray(np.linalg.inv(np.eye(3) + fit.information @ covariances), dtype=float)
+        inverses = _inverses(np.eye(3) + fit.information @ covariances)
         weights = inverses @ fit.information
         pulls = _multiply(weights, _wrapped(pairs.predicted(mount) - relative)) + _multiply(inverses, fit.gradients)
         return _Linearization(
@@ -523,7 +529,7 @@ class MountEstimator:
         # errors of the robot's steps; that of position less the mean effect of that of heading
         split = np.tile(np.eye(3), (len(errors), 1, 1))
         split[:, :2, 2] = -self._pairs.across / 2
-        split = split @ np.linalg.inv(linear.by_step)
+        split = split @ _inverses(linear.by_step)
         variances = np.diagonal(split @ covariances @ split.transpose(0, 2, 1), axis1=1, axis2=2)
         squares = (_multiply(split, errors) ** 2 + variances) / self._pairs.travel[:, None]
         x, y, heading = (linear.robust @ squares / linear.robust.sum()).tolist()
@@ -540,12 +546,11 @@ class MountEstimator:
         options, pairs, at = self._options, self._pairs, np.flatnonzero(free)
         gradients, information = linear.gradients[:, at], linear.information[:, at][:, :, at]
         prior = self._prior[np.ix_(at, at)]
-        model = np.linalg.inv(information.sum(axis=0) + prior)
+        model = _inverses((information.sum(axis=0) + prior)[None])[0]
         blocks = np.minimum(pairs.span * options.blocks, options.blocks - 1).astype(np.int64)
         kept = [(blocks[:, 1] < block) | (blocks[:, 0] > block) for block in range(options.blocks)]
-        replicates = np.array(
-            [np.linalg.solve(information[k].sum(axis=0) + prior, gradients[k].sum(axis=0)) for k in kept]
-        )
+        inverses = _inverses(np.array([information[k].sum(axis=0) + prior for k in kept]))
+        replicates = _multiply(inverses, np.array([gradients[k].sum(axis=0) for k in kept]))
         off = replicates - replicates.mean(axis=0)
         jackknife = (options.blocks - 1) / options.blocks * off.T @ off
         late = _wrapped(pairs.predicted(mount, pairs.later) - pairs.predicted(mount))
@@ -561,7 +566,7 @@ def _pair_weights(pulls: FloatArray, weights: FloatArray, options: MountEstimati
 
     A pull is W d, with the weight W and the residual d, which may be anything where W is singular.
     """
-    residuals = np.linalg.solve(weights + options.ridge * np.eye(3), pulls[:, :, None])[:, :, 0]
+    residuals = _multiply(_inverses(weights + options.ridge * np.eye(3)), pulls)
     distances = np.maximum((pulls * residuals).sum(axis=1), 0.0)
     usual = max(float(np.median(distances)), np.finfo(float).tiny)
     robust: FloatArray = (1 + distances / (usual * options.pair_robustness**2)) ** -2
