@@ -121,7 +121,7 @@ def test_right_stamps_and_robots_that_do_not_turn_change_nothing(tmp_path: Path,
     assert found.scans.stamps.tolist() == stated.scans.stamps.tolist()
 
 
-def test_poses_that_lag_by_half_a_sweep_are_no_evidence(tmp_path: Path) -> None:
+def test_stamps_at_the_middle_of_the_sweep_are_no_evidence(tmp_path: Path) -> None:
     path = write_log(tmp_path / "a.mcap", BeamTimes(-0.5, 0.5))
     assert localized(path).notes == ()
 
