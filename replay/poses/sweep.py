@@ -13,7 +13,7 @@ scans, so that drift of the poses does not matter. Hypotheses are compared in pa
 scans, which have a mean and a standard error.
 
 Beside the hypotheses that can be chosen there are others, half a sweep off each: where one of these fits best, the
-poses lag, or something else is wrong, and the log's own times are kept.
+clocks of poses and scans differ, or something else is wrong, and the log's own times are kept.
 """
 
 from __future__ import annotations
