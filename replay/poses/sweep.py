@@ -74,8 +74,7 @@ class SweepOptions:
     """The share of outliers in the density."""
 
     min_t: float = 4.0
-    """The mean difference to the log's own times must be so many standard errors. In simulated sessions that were
-    stamped right none came near, with poses of all kinds (docs/poses.md, «Deskewing»)."""
+    """The mean difference to the log's own times must be so many standard errors."""
 
     min_t_others: float = 2.0
     """The mean differences to all other hypotheses that can be chosen must be so many."""
