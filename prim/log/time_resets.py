@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
+from itertools import pairwise
 
 import numpy as np
 
@@ -11,6 +12,9 @@ from prim.log.source import Message
 
 MIN_RESET = 1_000_000_000
 """Times that go back by less (ns) are messages that were logged in another order; set by hand."""
+
+MIN_RUN = 10
+"""Fewer messages between two resets are a log that was written in another order; set by hand."""
 
 GAP = 100_000_000
 """What comes after a reset is put so long (ns) behind what was before; set by hand."""
@@ -25,16 +29,21 @@ def find_shifts(log_times: Stamps) -> tuple[int, ...]:
     Returns:
         What is to be added from the start on (0), and after each reset (ns).
     """
-    shifts = [0]
-    if not (log_times < np.maximum.accumulate(log_times) - MIN_RESET).any():
+    resets = np.flatnonzero(np.diff(log_times) < -MIN_RESET) + 1
+    runs = np.split(log_times, resets)
+    if len(runs) == 1 or not all(len(run) >= MIN_RUN for run in runs):
         return (0,)
-    latest: int | None = None
-    for time in log_times.tolist():
-        if latest is not None and time < latest - MIN_RESET:
-            shifts.append(shifts[-1] + latest - time + GAP)
-            latest = time
-        latest = time if latest is None else max(latest, time)
+    if not all(_overlap(before, after) for before, after in pairwise(runs)):
+        return (0,)
+    shifts = [0]
+    for before, after in pairwise(runs):
+        shifts.append(shifts[-1] + int(before.max() - after[0]) + GAP)
     return tuple(shifts)
+
+
+def _overlap(before: Stamps, after: Stamps) -> bool:
+    """Return whether two runs of messages are of the same times; else they are one, written in another order."""
+    return bool(after.max() > before.min() + MIN_RESET and after.min() < before.max() - MIN_RESET)
 
 
 def moved_behind_resets(messages: Iterable[Message], shifts: Sequence[int]) -> Iterator[Message]:
@@ -47,11 +56,10 @@ def moved_behind_resets(messages: Iterable[Message], shifts: Sequence[int]) -> I
     Yields:
         The messages; each topic's times are moved from where they go back.
     """
-    latest: dict[str, int] = {}
+    last: dict[str, int] = {}
     resets: dict[str, int] = {}
     for topic, time, data in messages:
-        if time < latest.get(topic, time) - MIN_RESET:
+        if time < last.get(topic, time) - MIN_RESET:
             resets[topic] = min(resets.get(topic, 0) + 1, len(shifts) - 1)
-            latest[topic] = time
-        latest[topic] = max(latest.get(topic, time), time)
+        last[topic] = time
         yield Message(topic, time + shifts[resets.get(topic, 0)], data)

@@ -134,10 +134,25 @@ def test_what_follows_a_reset_is_put_behind_what_was_before(
 
 
 def test_shifts_after_resets() -> None:
-    times = np.array([0, 5, 4, 10, 1, 3, 0, 2], dtype=np.int64) * SECOND
-    shifts = find_shifts(times)
+    run = np.arange(0, 20, dtype=np.int64) * SECOND
+    shifts = find_shifts(np.concatenate((run + 5 * SECOND, run, run)))
     assert len(shifts) == 3
-    moved = [message.log_time for message in moved_behind_resets([Message("/a", int(t), b"") for t in times], shifts)]
-    ordered = [t for k, t in enumerate(moved) if k != 2]
-    assert ordered == sorted(ordered)
-    assert find_shifts(np.array([5, 4, 6], dtype=np.int64) * SECOND // 10) == (0,)
+    messages = [Message("/a", int(time), b"") for part in (run + 5 * SECOND, run, run) for time in part]
+    moved = [message.log_time for message in moved_behind_resets(messages, shifts)]
+    assert moved == sorted(moved)
+
+
+@pytest.mark.parametrize(
+    "seconds",
+    [
+        *([*range(30)], [*range(30, 0, -1)], [*range(20, 40), *range(20)], [1, 3, 5, 2, 4, 6]),
+        [*range(0, 40, 2), *range(39, 0, -2)],
+    ],
+    ids=["sorted", "reversed", "swapped", "short", "there and back"],
+)
+def test_a_log_that_is_written_in_another_order_has_no_resets(seconds: list[int]) -> None:
+    assert find_shifts(np.array(seconds, dtype=np.int64) * SECOND) == (0,)
+
+
+def test_messages_of_nearly_the_same_time_are_no_reset() -> None:
+    assert find_shifts(np.array([5, 4, 6] * 20, dtype=np.int64) * SECOND // 10) == (0,)
