@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -69,7 +70,7 @@ def _opener(file: LogFile) -> Callable[[LogFile, bool], LogReader]:
             return open_source
     for magic, (what, hint) in _UNSUPPORTED.items():
         if file.head.startswith(magic):
-            raise LogReadError(file.path, f"{what}, not a log", hint.format(file.path))
+            raise LogReadError(file.path, f"{what}, not a log", hint.format(shlex.quote(str(file.path))))
     if not file.head:
         raise LogReadError(file.path, "an empty file (0 bytes)", _KNOWN)
     from prim.log import carmen
