@@ -70,6 +70,8 @@ def _opener(file: LogFile) -> Callable[[LogFile, bool], LogReader]:
     for magic, (what, hint) in _UNSUPPORTED.items():
         if file.head.startswith(magic):
             raise LogReadError(file.path, f"{what}, not a log", hint.format(file.path))
+    if file.head[TAR_AT:].startswith(TAR_MAGIC):
+        raise LogReadError(file.path, "a tar archive, not a log", f"unpack it with: tar -xf {file.path}")
     if not file.head:
         raise LogReadError(file.path, "an empty file (0 bytes)", _KNOWN)
     from prim.log import carmen
@@ -109,7 +111,13 @@ _UNSUPPORTED = {
     b"RRF2": ("a rerun recording", "open it with: rerun {}"),
     b"#ROSBAG V1": ("a ROS 1 bag of the old format 1.2", "convert it with: rosbag fix {0} {0}.v2.bag"),
     b"PK\x03\x04": ("a ZIP archive", "unpack it with: unzip {}"),
+    b"BZh": ("compressed by bzip2", "unpack it with: bunzip2 --keep {}"),
+    b"\xfd7zXZ\0": ("compressed by xz", "unpack it with: unxz --keep {}"),
+    b"\x04\x22\x4d\x18": ("compressed by lz4", "unpack it with: unlz4 {}"),
 }
 """First bytes of files that cannot be read, what they are, and what to do."""
+
+TAR_AT, TAR_MAGIC = 257, b"ustar"
+"""What tells a tar archive, and at which byte."""
 
 _KNOWN = "give an MCAP log, a ROS 1 or ROS 2 bag, or a log of CARMEN"
