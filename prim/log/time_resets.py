@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
+from itertools import pairwise
 
 import numpy as np
 
@@ -10,7 +11,8 @@ from prim.arrays import Stamps
 from prim.log.source import Message
 
 MIN_RESET = 1_000_000_000
-"""Times that go back by less (ns) are messages that were logged in another order; set by hand."""
+"""Times that go back by less (ns) from one message to the next are messages that were logged in another order; set
+by hand."""
 
 GAP = 100_000_000
 """What comes after a reset is put so long (ns) behind what was before; set by hand."""
@@ -25,16 +27,22 @@ def find_shifts(log_times: Stamps) -> tuple[int, ...]:
     Returns:
         What is to be added from the start on (0), and after each reset (ns).
     """
+    resets = np.flatnonzero(np.diff(log_times) < -MIN_RESET) + 1
     shifts = [0]
-    if not (log_times < np.maximum.accumulate(log_times) - MIN_RESET).any():
-        return (0,)
-    latest: int | None = None
-    for time in log_times.tolist():
-        if latest is not None and time < latest - MIN_RESET:
-            shifts.append(shifts[-1] + latest - time + GAP)
-            latest = time
-        latest = time if latest is None else max(latest, time)
+    for before, after in pairwise(np.split(log_times, resets)):
+        shifts.append(shifts[-1] + int(before.max() - after[0]) + GAP)
     return tuple(shifts)
+
+
+def reset_notes(shifts: Sequence[int]) -> list[str]:
+    """Return what a user should know of resets, which :func:`find_shifts` found: nothing where there are none."""
+    if len(shifts) == 1:
+        return []
+    times = f"{len(shifts) - 1} time{'s' * (len(shifts) > 2)}"
+    return [
+        f"the log's own times are set back {times}, by {shifts[-1] / 1e9:.1f} s in all: what follows is put behind "
+        "what was before"
+    ]
 
 
 def moved_behind_resets(messages: Iterable[Message], shifts: Sequence[int]) -> Iterator[Message]:
@@ -47,11 +55,10 @@ def moved_behind_resets(messages: Iterable[Message], shifts: Sequence[int]) -> I
     Yields:
         The messages; each topic's times are moved from where they go back.
     """
-    latest: dict[str, int] = {}
+    last: dict[str, int] = {}
     resets: dict[str, int] = {}
     for topic, time, data in messages:
-        if time < latest.get(topic, time) - MIN_RESET:
+        if time < last.get(topic, time) - MIN_RESET:
             resets[topic] = min(resets.get(topic, 0) + 1, len(shifts) - 1)
-            latest[topic] = time
-        latest[topic] = max(latest.get(topic, time), time)
+        last[topic] = time
         yield Message(topic, time + shifts[resets.get(topic, 0)], data)
