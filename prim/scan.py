@@ -161,12 +161,14 @@ class PosedScan:
         scan: The whole scan.
         pose: The laser's pose in the map frame at the first beam.
         pieces: The scan in parts, each with the laser's pose while it was taken (see :func:`deskew`).
+        scanner: Which of the scanners took it, from 0.
     """
 
     position: int
     scan: Scan
     pose: Pose2D
     pieces: Sequence[tuple[Scan, Pose2D]]
+    scanner: int = 0
 
     @property
     def points(self) -> FloatArray:
@@ -234,7 +236,9 @@ def reconciled_angles(scan: Scan) -> Scan:
         return scan
     allowed = max(2 * abs(field) / steps, abs(field) / 100)
     end = scan.angle_increment * steps
-    if abs(end - field) <= allowed or (end and abs(wrap_angle(end - field)) <= allowed):  # False for NaN
+    turns_once = abs(field) + allowed < abs(end) <= 2 * math.pi + allowed
+    wrapped = turns_once and abs(wrap_angle(end - field)) <= allowed
+    if abs(end - field) <= allowed or wrapped:  # both False for NaN
         return scan
     return replace(scan, angle_increment=field / steps)
 

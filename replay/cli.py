@@ -107,8 +107,8 @@ def replay(
     sweep: Annotated[
         SweepName,
         typer.Option(
-            help="What a scan's stamp is the time of, its first or last beam; reversed: the last beam is measured "
-            "first. auto: as the log says, unless scans clearly fit each other better otherwise."
+            help="Whose time a scan's stamp is: the first beam's, or the last one's; reversed: beams run against "
+            "time. auto: as the log says, unless scans clearly fit each other better otherwise."
         ),
     ] = SweepName.AUTO,
     start: Annotated[float | None, typer.Option(metavar="S", help="Begin S seconds into the log.")] = None,

@@ -239,7 +239,8 @@ def topic_table(summary: LogSummary) -> list[list[str]]:
 def _row(row: TopicSummary) -> list[str]:
     topic = row.topic
     package, _, kind = (topic.type or "?").rpartition("/")
-    kind = f"{package.removesuffix('/msg')}/{kind}" if package else kind
+    if package and topic.content is None:  # of others the name alone does not say what they are
+        kind = f"{package.removesuffix('/msg')}/{kind}"
     return [
         topic.name,
         kind if topic.encoding in ("cdr", "carmen") else f"{kind} ({topic.encoding})",

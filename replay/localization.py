@@ -73,6 +73,8 @@ def localize(scans: ScanLog, options: ReplayOptions, timer: StageTimer) -> Local
     elif not scans.sweep:
         note = f"--sweep {options.sweep} changes nothing: scans have no time_increment that is plausible"
         found = found._replace(notes=(*found.notes, note))
+    if found.poses.mount_assumed and len(scans.scanners) == 1:
+        found = found._replace(poses=_with_suggested_mount(found.poses, found.scans, options, timer))
     if not options.match_scans:
         return found
     from replay.poses.scan_matching import match_scans  # when it is needed: a replay without it starts faster
@@ -103,6 +105,17 @@ def pose_scans(scans: ScanLog, poses: LaserPoses, options: ReplayOptions, timer:
 def _retimed(scans: ScanLog, options: ReplayOptions) -> ScanLog:
     """Return scans whose beams were measured when the options say so."""
     return scans if options.sweep == SweepName.AUTO else scans.retimed(BEAM_TIMES[options.sweep])
+
+
+def _with_suggested_mount(poses: LaserPoses, scans: ScanLog, options: ReplayOptions, timer: StageTimer) -> LaserPoses:
+    """Add a note where the scans agree better with the laser elsewhere on the robot than at its origin."""
+    from replay.poses.mount_estimation import estimate_mount  # when it is needed: a replay without it starts faster
+
+    posed = partial(pose_scans, scans, options=options, timer=timer)
+    estimate = estimate_mount(poses, scans.stamps, posed)
+    if estimate is None or not estimate.is_significant():
+        return poses
+    return replace(poses, notes=(*poses.notes, estimate.note()))
 
 
 def _look_up_poses(provider: PoseProvider, scans: ScanLog, options: ReplayOptions) -> Localization:

@@ -229,6 +229,7 @@ class Pipeline:
                 messages_lost=log.messages_lost,
                 poses=posed_scans.poses,
                 stamps=scans.stamps,
+                scanner=scans.scanner,
                 pose_rmse=evaluator.pose_rmse(),
                 pose_nees=evaluator.pose_nees(),
                 grid=outcome.grid,

@@ -47,7 +47,7 @@ MAX_RANGE_PARAMETERS = {
 }
 
 NARROW_FIELDS = {400: math.radians(100), 401: math.radians(100)}
-"""Scanners whose number of readings tells another field of view (rad) than half a turn."""
+"""Scanners whose number of readings means another field of view (rad) than half a turn."""
 
 CONSTANT_MOUNT = (0.02, math.radians(1.0))
 """The laser's pose on the robot is constant if it stays within this (m, rad): poses have few digits."""

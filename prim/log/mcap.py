@@ -185,7 +185,7 @@ class McapReader(LogReader):
         return shifts
 
     def _written_times(self, summary: Summary, channel: int) -> Iterator[Stamps]:
-        """Yield for each chunk when messages of a channel were logged (ns), in the order in which they were written."""
+        """Yield for each chunk when messages of a channel were logged (ns), in the order of writing."""
         for chunk in sorted(summary.chunk_indexes, key=lambda index: index.chunk_start_offset):
             at = chunk.message_index_offsets.get(channel)
             if at is not None:

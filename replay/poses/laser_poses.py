@@ -142,7 +142,7 @@ class LaserPoses:
         fusion: The fusion that they come from.
         mounts: The laser's poses (N, 3) on the robot whose poses were fused.
         matched: Whether the poses are corrected by matching the scans with the map.
-        mount_assumed: Whether the laser is only taken to be at the robot's origin: nothing tells its mount.
+        mount_assumed: Whether the laser is only taken to be at the robot's origin: its mount is not in the log.
     """
 
     source: str

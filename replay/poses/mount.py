@@ -34,7 +34,7 @@ class LaserMounts(NamedTuple):
         poses: (M, 3) x, y (m), heading (rad).
         upside_down: Whether the laser is mounted upside down (M,).
         notes: What was assumed.
-        assumed: Whether a laser is only taken to be at the robot's origin: nothing tells its mount.
+        assumed: Whether a laser is only taken to be at the robot's origin: its mount is not in the log.
     """
 
     poses: FloatArray

@@ -13,7 +13,7 @@ scans, so that drift of the poses does not matter. Hypotheses are compared in pa
 scans, which have a mean and a standard error.
 
 Beside the hypotheses that can be chosen there are others, half a sweep off each: where one of these fits best, the
-poses lag, or something else is wrong, and the log's own times are kept.
+clocks of poses and scans differ, or something else is wrong, and the log's own times are kept.
 """
 
 from __future__ import annotations
@@ -74,8 +74,7 @@ class SweepOptions:
     """The share of outliers in the density."""
 
     min_t: float = 4.0
-    """The mean difference to the log's own times must be so many standard errors. In simulated sessions that were
-    stamped right none came near, with poses of all kinds (docs/poses.md, «Deskewing»)."""
+    """The mean difference to the log's own times must be so many standard errors."""
 
     min_t_others: float = 2.0
     """The mean differences to all other hypotheses that can be chosen must be so many."""
@@ -191,8 +190,12 @@ class _PoseSamples:
         """Look up the poses at all times (in units of ``duration``, ns) that the hypotheses name."""
         times = sorted({time for hypothesis in hypotheses for time in hypothesis})
         found = poses_at(np.concatenate([stamps + round(time * duration) for time in times]))
-        valid = found.valid.reshape(len(times), -1).all(axis=0)
-        row = {position: k for k, position in enumerate(positions.tolist()) if valid[k]}
+        known = found.valid.reshape(len(times), -1).sum(axis=0) == len(times)
+        row = {
+            position: k
+            for k, (position, is_known) in enumerate(zip(positions.tolist(), known.tolist(), strict=True))
+            if is_known
+        }
         return cls(row, dict(zip(times, found.poses.reshape(len(times), -1, 3), strict=True)))
 
     def at(self, positions: Sequence[int], times: BeamTimes) -> tuple[FloatArray, FloatArray]:
@@ -273,9 +276,9 @@ def _log_likelihoods(points: Sequence[FloatArray], beams: _Beams, motion: float,
 def _kernel_fits(
     cells: FloatArray, shape: tuple[int, ...], beams: _Beams, half: NDArray[np.intp], options: SweepOptions
 ) -> FloatArray:
-    """Compute the log-likelihoods (kernels, scans) of end points (N, 2) in cells, each half by the other's density."""
+    """Compute the log-likelihoods (kernels, scans) of end points (N, 2, in cells), each half by the other's."""
     index = np.floor(cells).astype(np.intp)
-    within = ((index >= 0) & (index < shape)).all(axis=1)
+    within: NDArray[np.bool_] = np.logical_and.reduce((index >= 0) & (index < shape), axis=1)
     index[~within] = 0
     flat = index @ (shape[1], 1)
     uniform = options.outlier_share / (shape[0] * shape[1])
@@ -319,8 +322,8 @@ def _block_sums(hypotheses: Sequence[BeamTimes], fits: Sequence[_WindowFit], opt
     sums = []
     for fit in fits:
         of_scans = fit.log_likelihoods[np.arange(len(hypotheses)), kernels]
-        for block in np.array_split(of_scans, max(fit.beams.scans // options.block_scans, 1), axis=1):
-            sums.append(block.sum(axis=1))
+        blocks = np.array_split(of_scans, max(fit.beams.scans // options.block_scans, 1), axis=1)
+        sums += [block.sum(axis=1) for block in blocks]
     return np.array(sums)
 
 

@@ -29,7 +29,7 @@ SECOND = 1_000_000_000
 
 @dataclass(frozen=True)
 class ClockOptions:
-    """The numbers by which clocks are told apart; set by hand."""
+    """The numbers by which clocks are distinguished; set by hand."""
 
     max_lag: float = 0.5
     """Clocks that differ by less (s) are the same: messages take that long until they are logged."""

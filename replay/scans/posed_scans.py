@@ -65,7 +65,7 @@ class PosedScans:
                 prepared = self._prepared(position, scan)
                 pose, end = self.poses.at(position), self.poses.end_at(position)
                 pieces = deskew(prepared, pose, end, self._options.deskew_tolerance)
-                yield PosedScan(position, prepared, pose, pieces)
+                yield PosedScan(position, prepared, pose, pieces, int(self.scan_log.scanner[position]))
 
     def notes(self) -> list[str]:
         """Return what a user should know of the poses and of scans that were left out."""
