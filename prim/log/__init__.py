@@ -88,13 +88,13 @@ def _open_mcap(file: LogFile, recover: bool) -> LogReader:
 
 
 def _open_bag(file: LogFile, recover: bool) -> LogReader:
-    from prim.log.bags import Ros1BagReader
+    from prim.log.bags import RecoveredBagReader, Ros1BagReader
 
-    return Ros1BagReader(file, recover)
+    return RecoveredBagReader(file) if recover else Ros1BagReader(file)
 
 
 def _open_sqlite(file: LogFile, recover: bool) -> LogReader:
-    from prim.log.bags import SqliteBagReader
+    from prim.log.sqlite import SqliteBagReader
 
     return SqliteBagReader(file, recover)
 
