@@ -108,7 +108,7 @@ class ScanLog:
         self.topics, self._topic_notes = choose_scan_topics(log, options.topics)
         self.log = log
         self.unusable: dict[int, str] = {}
-        self._reconciled: set[int] = set()
+        self._contradictions: dict[str, set[int]] = {}
         self._offsets: Stamps | None = None
         self._is_reversed = False
         self._iterated: NDArray[np.intp] | None = None
@@ -209,9 +209,9 @@ class ScanLog:
     def _as_scan(self, number: int, topic: str, value: Any) -> Scan:
         """Return a message's scan; its angles are those of its ends where its increment contradicts these."""
         scan: Scan = self._slicers[topic].scan(value) if topic in self._slicers else value
-        reconciled = reconciled_angles(scan)
-        if reconciled is not scan:
-            self._reconciled.add(number)
+        reconciled, contradiction = reconciled_angles(scan)
+        if contradiction is not None:
+            self._contradictions.setdefault(contradiction, set()).add(number)
         return reconciled
 
     def _with_times(self, scan: Scan, scanner: int) -> Scan:
@@ -230,11 +230,7 @@ class ScanLog:
             for scanner in self.scanners
             if scanner.given_sweep and not scanner.sweep and math.isfinite(scanner.given_sweep)
         ]
-        if self._reconciled:
-            notes.append(
-                f"angle_increment contradicts angle_min and angle_max in {pluralize(len(self._reconciled), 'scan')}: "
-                "beams are spread evenly between these"
-            )
+        notes += [what.format(pluralize(len(scans), "scan")) for what, scans in self._contradictions.items()]
         return notes + self._irregularities()
 
     def _irregularities(self) -> list[str]:

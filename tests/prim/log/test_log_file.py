@@ -53,10 +53,10 @@ def unpacked(path: Path, recover: bool = False) -> tuple[bytes, LogFile]:
 )
 def test_what_is_compressed_is_unpacked(tmp_path: Path, compress: Compress) -> None:
     path = tmp_path / "log"
-    path.write_bytes(compress(CONTENT))
+    path.write_bytes(packed := compress(CONTENT))
     data, file = unpacked(path)
     assert data == CONTENT and not file.lost
-    assert not file.data.exists() and path.read_bytes() == compress(CONTENT)
+    assert not file.data.exists() and path.read_bytes() == packed
 
 
 def test_the_layers_are_named(tmp_path: Path) -> None:
