@@ -14,6 +14,10 @@ MIN_RESET = 1_000_000_000
 """Times that go back by less (ns) from one message to the next are messages that were logged in another order; set
 by hand."""
 
+MIN_RUN = 5
+"""With fewer messages from one reset to the next, on average, messages are only written in another order; set by
+hand."""
+
 GAP = 100_000_000
 """What comes after a reset is put so long (ns) behind what was before; set by hand."""
 
@@ -28,10 +32,19 @@ def find_shifts(log_times: Stamps) -> tuple[int, ...]:
         What is to be added from the start on (0), and after each reset (ns).
     """
     resets = np.flatnonzero(np.diff(log_times) < -MIN_RESET) + 1
+    runs = np.split(log_times, resets)
+    if len(log_times) < MIN_RUN * len(runs) or not _overlap(runs):
+        return (0,)
     shifts = [0]
-    for before, after in pairwise(np.split(log_times, resets)):
+    for before, after in pairwise(runs):
         shifts.append(shifts[-1] + int(before.max() - after[0]) + GAP)
     return tuple(shifts)
+
+
+def _overlap(runs: Sequence[Stamps]) -> bool:
+    """Return whether any of the runs were at the same times: else they are only written in another order."""
+    spans = sorted((int(run.min()), int(run.max())) for run in runs)
+    return any(b[0] <= a[1] for a, b in pairwise(spans))
 
 
 def reset_notes(shifts: Sequence[int]) -> list[str]:

@@ -134,10 +134,18 @@ def test_what_follows_a_reset_is_put_behind_what_was_before(
 
 
 def test_shifts_after_resets() -> None:
-    times = np.array([0, 5, 4, 10, 1, 3, 0, 2], dtype=np.int64) * SECOND
+    times = np.array([0, 2, 5, 7, 6.5, 9, 10, 1, 2, 3, 4, 5, 0, 1, 2, 3], dtype=float) * SECOND
+    times = times.astype(np.int64)
     shifts = find_shifts(times)
     assert len(shifts) == 3
     moved = [message.log_time for message in moved_behind_resets([Message("/a", int(t), b"") for t in times], shifts)]
-    ordered = [t for k, t in enumerate(moved) if k != 2]
+    ordered = [t for k, t in enumerate(moved) if k != 4]
     assert ordered == sorted(ordered)
-    assert find_shifts(np.array([5, 4, 6], dtype=np.int64) * SECOND // 10) == (0,)
+
+
+@pytest.mark.parametrize(
+    "times", [[5, 4, 6], [4, 5, 6, 1, 2, 3], [1, 50, 30, 40, 20, 60], [*range(60, 99), *range(55)]]
+)
+def test_times_in_another_order_are_no_resets(times: list[int]) -> None:
+    """Tenths of seconds: by little, at disjoint times, often."""
+    assert find_shifts(np.array(times, dtype=np.int64) * SECOND // 10) == (0,)

@@ -124,9 +124,10 @@ def test_angles_are_those_of_the_ends_where_the_increment_contradicts(
     [
         (-180, 0, 1, 360, 1, "angle_max contradicts"),
         (-180, 360, 1, 360, 1, "angle_max contradicts"),
-        (-90, 90, 1, 91, 1, "fewer ranges"),
+        (-90, 90, 1, 100, 1, "fewer ranges"),
         (-90, 90, 1, 171, 1, "fewer ranges"),
         (-90, 90, 0.5, 181, 1, "angle_increment contradicts"),
+        (-90, 90, 1, 91, 2, "angle_increment contradicts"),
         (-90, 90, 2, 181, 1, "angle_increment contradicts"),
         (-90, 90, 0.97, 181, 1, "angle_increment contradicts"),
     ],
