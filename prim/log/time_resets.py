@@ -11,12 +11,10 @@ from prim.arrays import Stamps
 from prim.log.source import Message
 
 MIN_RESET = 1_000_000_000
-"""Times that go back by less (ns) from one message to the next are messages that were logged in another order; set
-by hand."""
+"""Times that go back by less (ns) are messages that were logged in another order; set by hand."""
 
-MIN_RUN = 5
-"""With fewer messages from one reset to the next, on average, messages are only written in another order; set by
-hand."""
+MIN_RUN = 10
+"""Fewer messages between two resets are a log that was written in another order; set by hand."""
 
 GAP = 100_000_000
 """What comes after a reset is put so long (ns) behind what was before; set by hand."""
@@ -33,7 +31,9 @@ def find_shifts(log_times: Stamps) -> tuple[int, ...]:
     """
     resets = np.flatnonzero(np.diff(log_times) < -MIN_RESET) + 1
     runs = np.split(log_times, resets)
-    if len(log_times) < MIN_RUN * len(runs) or not _overlap(runs):
+    if len(runs) == 1 or not all(len(run) >= MIN_RUN for run in runs):
+        return (0,)
+    if not all(_overlap(before, after) for before, after in pairwise(runs)):
         return (0,)
     shifts = [0]
     for before, after in pairwise(runs):
@@ -41,10 +41,9 @@ def find_shifts(log_times: Stamps) -> tuple[int, ...]:
     return tuple(shifts)
 
 
-def _overlap(runs: Sequence[Stamps]) -> bool:
-    """Return whether any of the runs were at the same times: else they are only written in another order."""
-    spans = sorted((int(run.min()), int(run.max())) for run in runs)
-    return any(b[0] <= a[1] for a, b in pairwise(spans))
+def _overlap(before: Stamps, after: Stamps) -> bool:
+    """Return whether two runs of messages are of the same times; else they are one, written in another order."""
+    return bool(after.max() > before.min() + MIN_RESET and after.min() < before.max() - MIN_RESET)
 
 
 def reset_notes(shifts: Sequence[int]) -> list[str]:

@@ -261,7 +261,7 @@ class ScanLog:
             if (scanner == k).any()
         }
         if times:
-            found = find_clock(self.log, self.topics, times, clock)
+            found = find_clock(self.log, times, clock)
             self.log = on_clock(self.log, found)
             if not found.keeps_headers:
                 names = [topic.name for topic in self.topics]

@@ -54,6 +54,7 @@ def test_a_replay_writes_a_recording_and_a_report_by_default(
     assert report["schema"] == "prim-replay/1"
     assert report["log"] == {
         "path": str(noisy_session.path),
+        "format": "MCAP",
         "duration_s": pytest.approx(noisy_session.duration),
         "scans": noisy_session.scans,
         "scans_used": noisy_session.scans,
