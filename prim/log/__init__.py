@@ -30,19 +30,26 @@ def open_log(path: str | Path, recover: bool = False) -> LogSource:
     Raises:
         LogReadError: The file cannot be read, is damaged (unless ``recover``), or is no log of a known format.
     """
-    path = Path(path)
-    if not path.is_dir():
-        return _open_file(path, recover)
-    from prim.log.parts import files_of_bag
+    from prim.log.parts import METADATA, files_of_bag, notes_on_part, notes_on_unlisted
 
+    path = Path(path)
+    if path.name == METADATA:
+        path = path.parent
+    if not path.is_dir():
+        log = _open_file(path, recover)
+        log.notes += notes_on_part(path)
+        return log
     try:
         files = files_of_bag(path)
+        unlisted = notes_on_unlisted(path, files)
     except OSError as error:
         raise LogReadError(path, f"cannot open: {error.strerror}") from error
-    return _open_files(path, files, recover)
+    log = _open_files(path, files, recover)
+    log.notes += unlisted
+    return log
 
 
-def _open_files(path: Path, files: Sequence[Path], recover: bool) -> LogSource:
+def _open_files(path: Path, files: Sequence[Path], recover: bool) -> LogReader:
     from prim.log.parts import PartsReader
 
     if len(files) == 1 and files[0].exists():

@@ -149,6 +149,15 @@ class McapReader(LogReader):
                 what = f"{name} has {delivered[name]} messages where the summary counts {self.topics[name].messages}"
                 raise LogReadError(self.path, f"damaged: {what}", RECOVER_HINT)
 
+    def log_times(self, topic: str) -> Stamps:
+        """See :meth:`prim.log.reader.LogReader.log_times`: by the index where there is one."""
+        if self._recover or self._summary is None or not self._summary.chunk_indexes or len(self._shifts) > 1:
+            return super().log_times(topic)
+        numbers = [number for number, channel in self._contents.channels.items() if channel.topic == topic]
+        with translated_errors(self.path):
+            times = [part for number in numbers for part in self._written_times(self._summary, number)]
+        return np.sort(np.concatenate(times)) if times else np.zeros(0, dtype=np.int64)
+
     def _indexed_messages(self, summary: Summary, topics: tuple[str, ...]) -> Iterator[Message]:
         """Yield messages in the order of log times, by the index of chunks.
 

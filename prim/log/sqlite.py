@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 
+from prim.arrays import Stamps
 from prim.errors import LogReadError
 from prim.log.decoding.codecs import SCAN_CONTENTS, content_of
 from prim.log.log_file import LogFile
@@ -116,6 +117,17 @@ class SqliteBagReader(LogReader):
                 query = f"SELECT {columns} FROM messages WHERE {where} ORDER BY rowid"
                 times = [time for (time,) in self._base.execute(query)]
         return find_shifts(np.array(times, dtype=np.int64))
+
+    def log_times(self, topic: str) -> Stamps:
+        """See :meth:`prim.log.reader.LogReader.log_times`: without reading the messages."""
+        if self._recover or len(self._shifts) > 1:
+            return super().log_times(topic)
+        numbers = [number for number, name in self._numbers.items() if name == topic]
+        query = (
+            f"SELECT timestamp FROM messages WHERE topic_id IN ({', '.join('?' * len(numbers))}) ORDER BY timestamp"
+        )
+        with _translated_errors(self.path, RECOVER_HINT):
+            return np.array([time for (time,) in self._base.execute(query, numbers)], dtype=np.int64)
 
     def messages(self, *topics: str) -> Iterator[Message]:
         """See :meth:`prim.log.source.LogSource.messages`; a log that is recovered is read in the order of writing."""
