@@ -122,8 +122,10 @@ class ScanLog:
         numbers, scanner, stamps = self._read_stamps(options.clock)
         self.total = len(stamps)
         selected = selection.select(stamps) if self.total else np.zeros(0, dtype=np.intp)
+        if not self.total:
+            raise LogReadError(log.path, f"no scan on {self.names} can be decoded", "; ".join(log.lost))
         if not len(selected):
-            span = f"{(stamps.max() - stamps.min()) / 1e9:.1f} s" if self.total else "none"
+            span = f"{(stamps.max() - stamps.min()) / 1e9:.1f} s"
             what = f"no scan is selected of the {self.total} on {self.names} ({span} in all)"
             raise LogReadError(log.path, what, "give another --start, --end or --duration")
         self._numbers = numbers[selected]
