@@ -31,19 +31,26 @@ def open_log(path: str | Path, recover: bool = False) -> LogSource:
     Raises:
         LogReadError: The file cannot be read, is damaged (unless ``recover``), or is no log of a known format.
     """
-    path = Path(path)
-    if not path.is_dir():
-        return _open_file(path, recover)
-    from prim.log.parts import files_of_bag
+    from prim.log.parts import METADATA, files_of_bag, notes_on_part, notes_on_unlisted
 
+    path = Path(path)
+    if path.name == METADATA:
+        path = path.parent
+    if not path.is_dir():
+        log = _open_file(path, recover)
+        log.notes += notes_on_part(path)
+        return log
     try:
         files = files_of_bag(path)
+        unlisted = notes_on_unlisted(path, files)
     except OSError as error:
         raise LogReadError(path, f"cannot open: {error.strerror}") from error
-    return _open_files(path, files, recover)
+    log = _open_files(path, files, recover)
+    log.notes += unlisted
+    return log
 
 
-def _open_files(path: Path, files: Sequence[Path], recover: bool) -> LogSource:
+def _open_files(path: Path, files: Sequence[Path], recover: bool) -> LogReader:
     from prim.log.parts import PartsReader
 
     if len(files) == 1 and files[0].exists():
@@ -71,6 +78,10 @@ def _opener(file: LogFile) -> Callable[[LogFile, bool], LogReader]:
     for magic, (what, hint) in _UNSUPPORTED.items():
         if file.head.startswith(magic):
             raise LogReadError(file.path, f"{what}, not a log", hint.format(shlex.quote(str(file.path))))
+    if file.head[TAR_AT:].startswith(TAR_MAGIC):
+        raise LogReadError(
+            file.path, "a tar archive, not a log", f"unpack it with: tar -xf {shlex.quote(str(file.path))}"
+        )
     if not file.head:
         raise LogReadError(file.path, "an empty file (0 bytes)", _KNOWN)
     from prim.log import carmen
@@ -87,13 +98,13 @@ def _open_mcap(file: LogFile, recover: bool) -> LogReader:
 
 
 def _open_bag(file: LogFile, recover: bool) -> LogReader:
-    from prim.log.bags import Ros1BagReader
+    from prim.log.bags import RecoveredBagReader, Ros1BagReader
 
-    return Ros1BagReader(file, recover)
+    return RecoveredBagReader(file) if recover else Ros1BagReader(file)
 
 
 def _open_sqlite(file: LogFile, recover: bool) -> LogReader:
-    from prim.log.bags import SqliteBagReader
+    from prim.log.sqlite import SqliteBagReader
 
     return SqliteBagReader(file, recover)
 
@@ -110,7 +121,13 @@ _UNSUPPORTED = {
     b"RRF2": ("a rerun recording", "open it with: rerun {}"),
     b"#ROSBAG V1": ("a ROS 1 bag of the old format 1.2", "convert it with: rosbag fix {0} {0}.v2.bag"),
     b"PK\x03\x04": ("a ZIP archive", "unpack it with: unzip {}"),
+    b"BZh": ("compressed by bzip2", "unpack it with: bunzip2 --keep {}"),
+    b"\xfd7zXZ\0": ("compressed by xz", "unpack it with: unxz --keep {}"),
+    b"\x04\x22\x4d\x18": ("compressed by lz4", "unpack it with: unlz4 {}"),
 }
 """First bytes of files that cannot be read, what they are, and what to do."""
+
+TAR_AT, TAR_MAGIC = 257, b"ustar"
+"""What tells a tar archive, and at which byte."""
 
 _KNOWN = "give an MCAP log, a ROS 1 or ROS 2 bag, or a log of CARMEN"

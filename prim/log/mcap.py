@@ -29,7 +29,7 @@ from prim.log.log_file import LogFile
 from prim.log.reader import LogReader, ros2_name
 from prim.log.recovery import RECORD_LIMIT, RECOVER_HINT, RecordReader, read_chunk, translated_errors
 from prim.log.source import Message, Topic
-from prim.log.time_resets import find_shifts, moved_behind_resets
+from prim.log.time_resets import find_shifts, moved_behind_resets, reset_notes
 
 MAGIC = b"\x89MCAP0\r\n"
 
@@ -133,11 +133,11 @@ class McapReader(LogReader):
 
     def messages(self, *topics: str) -> Iterator[Message]:
         """See :meth:`prim.log.source.LogSource.messages`; a log that is recovered is read in file order."""
-        if self._recover or self._summary is None or not self._summary.chunk_indexes:
-            yield from self._unindexed_messages(topics)
-            return
         if len(self._shifts) > 1:
             yield from moved_behind_resets(self._unindexed_messages(topics), self._shifts)
+            return
+        if self._recover or self._summary is None or not self._summary.chunk_indexes:
+            yield from self._unindexed_messages(topics)
             return
         delivered: Counter[str] = Counter()
         with translated_errors(self.path):
@@ -148,6 +148,15 @@ class McapReader(LogReader):
             if name in self.topics and delivered[name] != self.topics[name].messages:
                 what = f"{name} has {delivered[name]} messages where the summary counts {self.topics[name].messages}"
                 raise LogReadError(self.path, f"damaged: {what}", RECOVER_HINT)
+
+    def log_times(self, topic: str) -> Stamps:
+        """See :meth:`prim.log.reader.LogReader.log_times`: by the index where there is one."""
+        if self._recover or self._summary is None or not self._summary.chunk_indexes or len(self._shifts) > 1:
+            return super().log_times(topic)
+        numbers = [number for number, channel in self._contents.channels.items() if channel.topic == topic]
+        with translated_errors(self.path):
+            times = [part for number in numbers for part in self._written_times(self._summary, number)]
+        return np.sort(np.concatenate(times)) if times else np.zeros(0, dtype=np.int64)
 
     def _indexed_messages(self, summary: Summary, topics: tuple[str, ...]) -> Iterator[Message]:
         """Yield messages in the order of log times, by the index of chunks.
@@ -169,19 +178,19 @@ class McapReader(LogReader):
             yield from sorted(_chunk_messages(stream.read(length), wanted), key=lambda message: message.log_time)
 
     def _find_shifts(self) -> tuple[int, ...]:
-        """Find out by the index whether the log's times were set back, and note that."""
+        """Find out whether the log's times were set back, and note that."""
         scans = {k for k, c in self._contents.channels.items() if self.topics[c.topic].content in SCAN_CONTENTS}
-        if self._recover or self._summary is None or not scans:
+        if not scans:
             return (0,)
-        with translated_errors(self.path):
-            parts = list(self._written_times(self._summary, min(scans)))
-            shifts = find_shifts(np.concatenate(parts)) if parts else (0,)
-        if len(shifts) > 1:
-            times = f"{len(shifts) - 1} time{'s' * (len(shifts) > 2)}"
-            self.notes = [
-                f"the log's own times are set back {times}, by {shifts[-1] / 1e9:.1f} s in all: what "
-                "follows is put behind what was before"
-            ]
+        if self._recover or self._summary is None or not self._summary.chunk_indexes:
+            name = self._contents.channels[min(scans)].topic
+            times = [message.log_time for message in self._unindexed_messages((name,))]
+            shifts = find_shifts(np.array(times, dtype=np.int64))
+        else:
+            with translated_errors(self.path):
+                parts = list(self._written_times(self._summary, min(scans)))
+                shifts = find_shifts(np.concatenate(parts)) if parts else (0,)
+        self.notes = reset_notes(shifts)
         return shifts
 
     def _written_times(self, summary: Summary, channel: int) -> Iterator[Stamps]:

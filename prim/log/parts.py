@@ -6,18 +6,27 @@ import re
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
+from prim.arrays import Stamps
 from prim.errors import LogReadError
+from prim.log.decoding.codecs import SCAN_CONTENTS
 from prim.log.reader import LogReader
-from prim.log.source import LogSource, Message, Topic
+from prim.log.source import Message, Topic
+from prim.log.time_resets import find_shifts, moved_behind_resets, reset_notes
 
 METADATA = "metadata.yaml"
 """The file in a ROS 2 bag's folder that lists the others."""
 
-LOG_SUFFIXES = (".mcap", ".db3", ".bag")
-"""How the names of logs in a folder end, whatever compression is named behind."""
+COMPRESSED_SUFFIXES = (".zstd", ".zst", ".gz")
+"""How the names of compressed files end."""
+
+_LOG_NAME = re.compile(r"\.(mcap|db3|bag|bag\.active)(\.(zstd|zst|gz))?$")
+"""How the names of logs in a folder end."""
 
 
 def files_of_bag(folder: Path) -> list[Path]:
@@ -33,29 +42,57 @@ def files_of_bag(folder: Path) -> list[Path]:
         LogReadError: The folder holds no log, or several that do not belong together.
     """
     listed = _listed_files(folder)
-    if listed:
+    if any(file.exists() for file in listed):
         return listed
-    found = sorted((path for path in folder.iterdir() if _is_log(path)), key=_part_number)
-    stems = {re.sub(r"_\d+$", "", _stem(path)) for path in found}
+    by_stem = {_stem(path): path for path in sorted(folder.iterdir(), key=_preference, reverse=True) if _is_log(path)}
+    found = sorted(by_stem.values(), key=_part_number)
+    if not found and listed:
+        return listed
     if not found:
         raise LogReadError(folder, "a folder without a log in it", "give a log, or the folder of a ROS 2 bag")
-    if len(found) > 1 and len(stems) > 1:
+    if len(found) > 1 and len({_part_number(path)[0] for path in found}) > 1:
         names = ", ".join(path.name for path in found)
         raise LogReadError(folder, f"a folder with {len(found)} logs ({names})", f"give one of them: {found[0]}")
     return found
 
 
-def bag_around(path: Path) -> list[Path]:
-    """Return the files of the split bag that a file belongs to by its metadata.yaml; else the file alone."""
-    try:
-        listed = _listed_files(path.parent)
-    except LogReadError:
-        return [path]
-    return listed if path.name in [other.name for other in listed] else [path]
+def notes_on_part(path: Path) -> list[str]:
+    """Return what a user should know of a file that metadata.yaml lists as one of several of a bag.
+
+    Args:
+        path: The file.
+
+    Returns:
+        The notes.
+    """
+    names = [file.name for file in _listed_files(path.parent)]
+    if len(names) < 2 or path.name not in names:
+        return []
+    which = (
+        f"{path.name} is part {names.index(path.name) + 1} of {len(names)} of a bag, whose other parts are not read"
+    )
+    return [f"{which} (static transforms, for one, may be in the first): for all give {path.absolute().parent}"]
+
+
+def notes_on_unlisted(folder: Path, files: Sequence[Path]) -> list[str]:
+    """Return what a user should know of parts of a bag in its folder that are not read.
+
+    Args:
+        folder: The folder.
+        files: The files that are read.
+
+    Returns:
+        The notes.
+    """
+    read = {_stem(file) for file in files}
+    bags = {_part_number(file)[0] for file in files}
+    others = [path for path in folder.iterdir() if _is_log(path) and _stem(path) not in read]
+    names = [path.name for path in sorted(others, key=_part_number) if _part_number(path)[0] in bags]
+    return [f"{METADATA} does not list {', '.join(names)}: not read; without {METADATA}, all are"] if names else []
 
 
 def _listed_files(folder: Path) -> list[Path]:
-    """Return the files that the folder's metadata.yaml lists; none without one. Raises LogReadError."""
+    """Return the files that the folder's metadata.yaml lists, each once; none where it does not tell."""
     path = folder / METADATA
     if not path.is_file():
         return []
@@ -65,32 +102,42 @@ def _listed_files(folder: Path) -> list[Path]:
     try:
         described: Any = YAML(typ="safe", pure=True).load(path.read_text(encoding="utf-8"))
         names = described["rosbag2_bagfile_information"]["relative_file_paths"]
-        files = [folder / Path(str(name)).name for name in names]
     except (OSError, YAMLError, ValueError, KeyError, TypeError, RecursionError):
         return []  # without it, the files are found by their names
-    return [_present(file) for file in files]
+    if not isinstance(names, list) or not all(isinstance(name, str) and Path(name).name for name in names):
+        return []
+    return list(dict.fromkeys(_present(folder / Path(name).name) for name in names))
 
 
 def _present(file: Path) -> Path:
     """Return a listed file under the name that it has: rosbag2 forgets or adds the suffix of its compression."""
-    for name in (file.name, f"{file.name}.zstd", f"{file.name}.zst", file.name.removesuffix(".zstd")):
-        if file.with_name(name).exists():
-            return file.with_name(name)
-    return file
+    plain = file.with_suffix("") if file.suffix in COMPRESSED_SUFFIXES else file
+    names = (file.name, plain.name, *(plain.name + suffix for suffix in COMPRESSED_SUFFIXES))
+    return next((file.with_name(name) for name in names if file.with_name(name).exists()), file)
 
 
 def _is_log(path: Path) -> bool:
-    return path.is_file() and any(f"{suffix}." in f"{path.name}." for suffix in LOG_SUFFIXES)
+    return path.is_file() and _LOG_NAME.search(path.name) is not None
+
+
+def _preference(path: Path) -> tuple[bool, str]:
+    """Return what sorts the log that is not compressed before the others of its name."""
+    return path.suffix in COMPRESSED_SUFFIXES, path.name
 
 
 def _stem(path: Path) -> str:
-    return re.sub(r"(\.mcap|\.db3|\.bag)(\..*)?$", "", path.name)
+    return _LOG_NAME.sub("", path.name)
 
 
 def _part_number(path: Path) -> tuple[str, int]:
-    """Return what sorts the parts of a bag: bag_2 comes before bag_10."""
+    """Return what sorts the parts of a bag: bag_2 comes before bag_10, and what their names have in common.
+
+    rosbag of ROS 1 puts the time at which a part was begun before its number.
+    """
     number = re.search(r"_(\d+)$", _stem(path))
-    return re.sub(r"_\d+$", "", _stem(path)), int(number[1]) if number else -1
+    if number is None:
+        return _stem(path), -1
+    return re.sub(r"\d{4}(-\d\d){5}$", "", _stem(path)[: number.start()]), int(number[1])
 
 
 class PartsReader(LogReader):
@@ -107,11 +154,11 @@ class PartsReader(LogReader):
     """
 
     def __init__(
-        self, path: Path, files: Sequence[Path], recover: bool, open_file: Callable[[Path], LogSource]
+        self, path: Path, files: Sequence[Path], recover: bool, open_file: Callable[[Path], LogReader]
     ) -> None:
         super().__init__(path, recover)
         self._stack = ExitStack()
-        self._parts: list[LogSource] = []
+        self._parts: list[LogReader] = []
         self._missing: list[str] = []
         try:
             for file in files:
@@ -121,10 +168,14 @@ class PartsReader(LogReader):
         except BaseException:
             self.close()
             raise
+        times = self._sort_parts()
         self.topics = self._merged_topics()
+        self._shifts = find_shifts(np.concatenate(times))
+        self.notes += [note for part in self._parts for note in part.notes]
+        self.notes += reset_notes(self._shifts)
         self.metadata = {name: values for part in self._parts for name, values in part.metadata.items()}
 
-    def _open_part(self, file: Path, open_file: Callable[[Path], LogSource]) -> None:
+    def _open_part(self, file: Path, open_file: Callable[[Path], LogReader]) -> None:
         try:
             if not file.exists():
                 raise LogReadError(file, f"a file of the bag {self.path} is missing", "read the rest with --recover")
@@ -175,5 +226,24 @@ class PartsReader(LogReader):
 
     def messages(self, *topics: str) -> Iterator[Message]:
         """See :meth:`prim.log.source.LogSource.messages`."""
-        for part in self._parts:
-            yield from part.messages(*topics)
+        messages = (message for part in self._parts for message in part.messages(*topics))
+        return moved_behind_resets(messages, self._shifts) if len(self._shifts) > 1 else messages
+
+    def _sort_parts(self) -> list[Stamps]:
+        """Sort the parts by their times, where these do not overlap: metadata.yaml may list them in another order.
+
+        Returns:
+            When the scans of a topic were logged (ns), by parts.
+        """
+        topics = [topic for part in self._parts for topic in part.holding(*SCAN_CONTENTS)]
+        times = [part.log_times(topics[0].name) if topics else np.zeros(0, np.int64) for part in self._parts]
+        order = sorted((of_part.min(), of_part.max(), k) for k, of_part in enumerate(times) if len(of_part))
+        positions = [k for _, _, k in order]
+        if len(order) < len(times) or positions == sorted(positions):
+            return times
+        if any(part.notes for part in self._parts) or any(b[0] < a[1] for a, b in pairwise(order)):
+            return times
+        self._parts = [self._parts[k] for k in positions]
+        names = ", ".join(part.path.name for part in self._parts)
+        self.notes = [f"the files of the bag are read in the order of their times: {names}"]
+        return [times[k] for k in positions]

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Container, Iterator, Mapping, Sequence
+from collections.abc import Callable, Container, Iterator, Mapping
 from pathlib import Path
 from typing import ClassVar, Self
 
+import numpy as np
 import zstandard
 
+from prim.arrays import Stamps
 from prim.errors import LogReadError
 from prim.log.decoding.codecs import Codec, Content, codec_of
 from prim.log.log_file import ZSTD_MAGIC, LogFile
@@ -33,7 +35,7 @@ class LogReader(ABC):
         self.path = path
         self._file_of_log = file
         self.lost: list[str] = [*file.lost] if file else []
-        self.notes: Sequence[str] = ()
+        self.notes: list[str] = []
         self.topics: Mapping[str, Topic] = {}
         self.metadata: Mapping[str, Mapping[str, str]] = {}
         self._recover = recover
@@ -60,6 +62,10 @@ class LogReader(ABC):
     @abstractmethod
     def messages(self, *topics: str) -> Iterator[Message]:
         """See :meth:`prim.log.source.LogSource.messages`."""
+
+    def log_times(self, topic: str) -> Stamps:
+        """Return when the messages of a topic were logged (N,) in ns. Raises LogReadError."""
+        return np.array([message.log_time for message in self.messages(topic)], dtype=np.int64)
 
     @property
     def messages_lost(self) -> int | None:

@@ -46,6 +46,17 @@ def _overlap(before: Stamps, after: Stamps) -> bool:
     return bool(after.max() > before.min() + MIN_RESET and after.min() < before.max() - MIN_RESET)
 
 
+def reset_notes(shifts: Sequence[int]) -> list[str]:
+    """Return what a user should know of resets, which :func:`find_shifts` found: nothing where there are none."""
+    if len(shifts) == 1:
+        return []
+    times = f"{len(shifts) - 1} time{'s' * (len(shifts) > 2)}"
+    return [
+        f"the log's own times are set back {times}, by {shifts[-1] / 1e9:.1f} s in all: what follows is put behind "
+        "what was before"
+    ]
+
+
 def moved_behind_resets(messages: Iterable[Message], shifts: Sequence[int]) -> Iterator[Message]:
     """Yield messages with log times that rise in spite of resets.
 

@@ -6,6 +6,7 @@ it (a device that counts from its start, stamps of 0, a simulation that was rese
 
 from __future__ import annotations
 
+import math
 from collections.abc import Container, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
@@ -26,6 +27,9 @@ MOVING = (Content.TRANSFORMS, Content.ODOMETRY, Content.POSE)
 SECOND = 1_000_000_000
 """Nanoseconds."""
 
+MIN_POSES = 3
+"""Fewer poses than these tell nothing of their clock: someone gave them by hand; set by hand."""
+
 
 @dataclass(frozen=True)
 class ClockOptions:
@@ -39,6 +43,21 @@ class ClockOptions:
 
     min_jump: float = 1.0
     """Stamps that go back by less (s) are messages that arrived in another order."""
+
+    max_pose_lag: float = 10.0
+    """Poses that differ by more (s) from when they were logged are on another clock: none take so long."""
+
+    min_drift: float = 0.02
+    """Drift that makes less (s) over a log is none."""
+
+    min_deviations: float = 5.0
+    """Drift is at least this many standard errors."""
+
+    min_messages: int = 10
+    """Fewer messages tell no drift."""
+
+    first: int = 500
+    """So many of the first messages of a topic tell whether poses are stamped by another clock at all."""
 
     sampled: int = 20_000
     """No more messages of a topic are read to find its clock."""
@@ -56,6 +75,9 @@ class Clock:
         all_by_log: Whether all topics are.
         lag: How long after its stamp a message is logged (ns).
         shifts: What is added to the stamps of a topic (ns).
+        drifts: What is added to them besides: for each ns after a stamp (ns) so many.
+        zeros: The topics some of whose stamps are 0, and how long after their stamps the others are logged (ns): so
+            much before it was logged such a message is taken to be stamped.
         offsets: What is added to stamps (ns) from the start on and after each reset of the clock; the one is used by
             which a message's stamp is nearest to when it was logged.
         notes: What a user should know.
@@ -65,13 +87,15 @@ class Clock:
     all_by_log: bool = False
     lag: int = 0
     shifts: Mapping[str, int] = field(default_factory=dict)
+    drifts: Mapping[str, tuple[int, float]] = field(default_factory=dict)
+    zeros: Mapping[str, int] = field(default_factory=dict)
     offsets: tuple[int, ...] = ()
     notes: tuple[str, ...] = ()
 
     @property
     def keeps_headers(self) -> bool:
         """Whether the header stamps stay as they are."""
-        return not (self.by_log or self.all_by_log or self.shifts or self.offsets)
+        return not (self.by_log or self.all_by_log or self.shifts or self.zeros or self.offsets)
 
     def stamp(self, topic: str, stamp: int, log_time: int) -> int:
         """Return a message's stamp (ns) on this clock.
@@ -86,9 +110,28 @@ class Clock:
         """
         if self.all_by_log or topic in self.by_log:
             return log_time - self.lag
+        if stamp == 0 and topic in self.zeros:
+            return log_time - self.zeros[topic]
         if self.offsets:
             return min((stamp + offset for offset in self.offsets), key=lambda moved: abs(moved - log_time))
-        return stamp + self.shifts.get(topic, 0)
+        since, drift = self.drifts.get(topic, (0, 0.0))
+        return stamp + self.shifts.get(topic, 0) + (round((stamp - since) * drift) if drift else 0)
+
+    def stamps(self, topic: str, stamps: Stamps, log_times: Stamps) -> Stamps:
+        """Return the stamps of many messages (ns) on this clock.
+
+        Args:
+            topic: Their topic.
+            stamps: The stamps of their headers (N,) in ns.
+            log_times: When they were logged (N,) in ns.
+
+        Returns:
+            The stamps (N,).
+        """
+        if self.keeps_headers:
+            return stamps
+        moved = [self.stamp(topic, *pair) for pair in zip(stamps.tolist(), log_times.tolist(), strict=True)]
+        return np.array(moved, dtype=np.int64)
 
 
 HEADER_CLOCK = Clock()
@@ -97,7 +140,6 @@ HEADER_CLOCK = Clock()
 
 def find_clock(
     log: LogSource,
-    topics: Sequence[Topic],
     scan_times: Mapping[str, tuple[Stamps, Stamps]],
     choice: str,
     options: ClockOptions = DEFAULTS,
@@ -106,7 +148,6 @@ def find_clock(
 
     Args:
         log: The log.
-        topics: The topics of scans.
         scan_times: By the topics' names, when each scan was logged and the stamp of its header, (N,) each, in ns.
         choice: One of ClockName: «header» leaves all stamps as they are, «log» takes when messages were logged,
             «auto» moves those onto one clock that are not.
@@ -122,61 +163,136 @@ def find_clock(
         return HEADER_CLOCK
     if choice == ClockName.LOG:
         return Clock(all_by_log=True)
-    logged, stamps = (np.concatenate(times) for times in zip(*scan_times.values(), strict=True))
+    stamped = {name: _without_zeros(*times) for name, times in scan_times.items()}
+    clock = _clock_of_stamped(log, {name: times for name, times in stamped.items() if len(times[0])}, options)
+    unstamped = [name for name, times in stamped.items() if not len(times[0])]
+    if unstamped:
+        clock = _with_topics_by_log(clock, unstamped, "0", _lag_of_poses(log, options))
+    clock = _with_zeros(clock, scan_times, stamped)
+    return _with_poses(log, clock, scan_times, options)
+
+
+def _without_zeros(logged: Stamps, stamps: Stamps) -> tuple[Stamps, Stamps]:
+    return logged[stamps != 0], stamps[stamps != 0]
+
+
+def _clock_of_stamped(
+    log: LogSource, scan_times: Mapping[str, tuple[Stamps, Stamps]], options: ClockOptions
+) -> Clock:
+    """Return the clock that brings scans, none of them stamped 0, onto that of the poses."""
+    if not scan_times:
+        return HEADER_CLOCK
     jumps = _jumps(scan_times, options)
     if len(jumps):
+        logged, stamps = (np.concatenate(times) for times in zip(*scan_times.values(), strict=True))
         return _clock_with_resets(logged, stamps, jumps)
-    max_lag = options.max_lag * SECOND
-    lags = {name: _lag(*times) for name, times in scan_times.items()}
-    if all(abs(lag) <= max_lag and stamps.any() for lag, _ in lags.values()):
+    lags = {name: _find_lag(*times, options) for name, times in scan_times.items()}
+    if all(lag.is_none(options) for lag in lags.values()):
         return HEADER_CLOCK
     reference = _lag_of_poses(log, options)
-    if reference is None:
-        return HEADER_CLOCK if stamps.any() else Clock(frozenset(lags), notes=(_by_log_note(list(lags), "0"),))
-    return _clock_of_scans(topics, scan_times, lags, reference, options)
+    return HEADER_CLOCK if reference is None else _clock_of_scans(scan_times, lags, reference, options)
 
 
 def _clock_of_scans(
-    topics: Sequence[Topic],
     scan_times: Mapping[str, tuple[Stamps, Stamps]],
-    lags: Mapping[str, tuple[int, float]],
-    reference: int,
+    lags: Mapping[str, _Lag],
+    reference: _Lag,
     options: ClockOptions,
 ) -> Clock:
-    """Return the clock that brings scans onto that of the poses, which are logged ``reference`` ns late."""
-    by_log: list[str] = []
-    shifts: dict[str, int] = {}
-    notes: list[str] = []
-    for name in (topic.name for topic in topics):
-        lag, spread = lags[name]
-        differs = abs(lag - reference) > options.max_lag * SECOND
-        if not scan_times[name][1].any():
-            by_log.append(name)
-        elif differs and spread <= options.steady * SECOND:
-            shifts[name] = lag - reference
-            side = "behind" if shifts[name] > 0 else "ahead of"
-            notes.append(
-                f"{name} is stamped {abs(shifts[name]) / SECOND:.3f} s {side} the poses by when both were logged: "
-                "its stamps are moved by that; --clock header leaves them"
-            )
-        elif differs and not _overlaps(*scan_times[name], reference):
-            by_log.append(name)
-    if by_log:
-        what = "0" if not any(scan_times[name][1].any() for name in by_log) else "those of another clock"
-        notes.append(_by_log_note(by_log, what))
-    return Clock(frozenset(by_log), lag=reference, shifts=shifts, notes=tuple(notes))
+    """Return the clock that brings scans onto that of the poses, which are logged ``reference`` late."""
+    clock = Clock(lag=reference.median)
+    for name, lag in lags.items():
+        drifts = lag.drift != 0 and reference.drift == 0
+        spread = lag.detrended if drifts else lag.spread
+        differs = abs(lag.median - reference.median) > options.max_lag * SECOND or drifts
+        if differs and spread <= options.steady * SECOND:
+            clock = _with_shift(clock, name, lag, reference.median, drifts)
+        elif differs and not _overlaps(*scan_times[name], reference.median):
+            clock = _with_topics_by_log(clock, [name], "those of another clock", reference)
+    return clock
+
+
+def _with_shift(clock: Clock, name: str, lag: _Lag, reference: int, drifts: bool) -> Clock:
+    """Move the stamps of a topic by a constant lag, and by what a clock drifts."""
+    shift = lag.median - reference
+    side = "behind" if shift > 0 else "ahead of"
+    rate = f" in the middle, by a clock that runs {100 * abs(lag.drift):.2g} % {'slow' if lag.drift > 0 else 'fast'}"
+    note = (
+        f"{name} is stamped {abs(shift) / SECOND:.3f} s {side} the poses by when both were logged"
+        f"{rate * drifts}: its stamps are moved by that; --clock header leaves them"
+    )
+    return replace(
+        clock,
+        shifts={**clock.shifts, name: shift},
+        drifts={**clock.drifts, name: (lag.middle, lag.drift)} if drifts else clock.drifts,
+        notes=(*clock.notes, note),
+    )
+
+
+def _with_topics_by_log(clock: Clock, names: Sequence[str], what: str, reference: _Lag | None) -> Clock:
+    """Stamp topics by when their messages were logged, as much earlier as the others are."""
+    note = (
+        f"the stamps of {', '.join(names)} are {what}: the times at which messages were logged are used; "
+        "--clock header leaves them"
+    )
+    lag = reference.median if reference is not None else clock.lag
+    return replace(clock, by_log=clock.by_log | {*names}, lag=lag, notes=(*clock.notes, note))
+
+
+def _with_zeros(
+    clock: Clock,
+    scan_times: Mapping[str, tuple[Stamps, Stamps]],
+    stamped: Mapping[str, tuple[Stamps, Stamps]],
+) -> Clock:
+    """Stamp single scans whose stamp is 0 by when they were logged."""
+    for name, (logged, stamps) in stamped.items():
+        count = len(scan_times[name][0]) - len(logged)
+        if not count or not len(logged) or name in clock.by_log:
+            continue
+        lag = int(np.median(logged - clock.stamps(name, stamps, logged)))
+        note = (
+            f"{count} of {count + len(logged)} stamps of {name} are 0: the times at which these messages were logged "
+            "are used; --clock header leaves them"
+        )
+        clock = replace(clock, zeros={**clock.zeros, name: lag}, notes=(*clock.notes, note))
+    return clock
+
+
+def _with_poses(
+    log: LogSource, clock: Clock, scan_times: Mapping[str, tuple[Stamps, Stamps]], options: ClockOptions
+) -> Clock:
+    """Move poses that are stamped by another clock than the scans onto that of these."""
+    if clock.offsets:
+        return clock
+    name, (logged, stamps) = next(iter(scan_times.items()))
+    reference = _find_lag(logged, clock.stamps(name, stamps, logged), options)
+    for topic in _moving_topics(log):
+        times = _times(log, topic, options.first)
+        if len(times[0]) < MIN_POSES:
+            continue
+        lag = _find_lag(*times, options)
+        if not times[1].any():
+            clock = _with_topics_by_log(clock, [topic.name], "0", reference)
+        elif (
+            abs(lag.median - reference.median) > options.max_pose_lag * SECOND
+            and lag.spread <= options.steady * SECOND
+        ):
+            clock = _with_poses_moved(clock, topic.name, lag.median - reference.median)
+    return clock
+
+
+def _with_poses_moved(clock: Clock, name: str, shift: int) -> Clock:
+    side = "behind" if shift > 0 else "ahead of"
+    note = (
+        f"{name} is stamped {abs(shift) / SECOND:.3f} s {side} the scans by when both were logged: its stamps are "
+        "moved by that; --clock header leaves them"
+    )
+    return replace(clock, shifts={**clock.shifts, name: shift}, notes=(*clock.notes, note))
 
 
 def _overlaps(logged: Stamps, stamps: Stamps, reference: int) -> bool:
     """Return whether the stamps are any of the times that the poses, which were logged as long, may have."""
     return bool(stamps.min() <= logged.max() - reference and stamps.max() >= logged.min() - reference)
-
-
-def _by_log_note(names: Sequence[str], what: str) -> str:
-    return (
-        f"the stamps of {', '.join(names)} are {what}: the times at which messages were logged are used; "
-        "--clock header leaves them"
-    )
 
 
 def _jumps(scan_times: Mapping[str, tuple[Stamps, Stamps]], options: ClockOptions) -> Stamps:
@@ -205,24 +321,65 @@ def _clock_with_resets(logged: Stamps, stamps: Stamps, jumps: Stamps) -> Clock:
     return Clock(offsets=tuple(offsets), notes=(note,))
 
 
-def _lag(logged: Stamps, stamps: Stamps) -> tuple[int, float]:
-    """Return how long after their stamps messages are logged (ns): the median, and the spread of the middle 90 %."""
+@dataclass(frozen=True)
+class _Lag:
+    """How long after their stamps the messages of a topic are logged.
+
+    Attributes:
+        median: Ns.
+        spread: Of the middle 90 % (ns).
+        drift: What it grows by for each ns of the stamps; 0 where that is not significant.
+        detrended: The spread (ns) without the drift.
+        middle: The stamp (ns) at which the lag is the median, as far as it grows.
+    """
+
+    median: int
+    spread: float
+    drift: float
+    detrended: float
+    middle: int
+
+    def is_none(self, options: ClockOptions) -> bool:
+        """Return whether messages are logged when they are stamped, but for the time that they take."""
+        drifts = self.drift and self.spread > options.steady * SECOND
+        return abs(self.median) <= options.max_lag * SECOND and not drifts
+
+
+def _find_lag(logged: Stamps, stamps: Stamps, options: ClockOptions) -> _Lag:
+    """Find how long after their stamps messages are logged, and whether that grows: by a straight line."""
     lags = logged - stamps
     low, middle, high = np.percentile(lags, (5, 50, 95))
-    return int(middle), float(high - low)
+    median, centre = int(middle), int(np.median(stamps))
+    since = (stamps - centre).astype(float)
+    unchanged = _Lag(median, float(high - low), 0.0, float(high - low), centre)
+    if len(lags) < options.min_messages or not np.ptp(since):
+        return unchanged
+    relative = (lags - median).astype(float)
+    since_mean, mean = since.mean(), relative.mean()
+    slope = float(((since - since_mean) @ (relative - mean)) / ((since - since_mean) @ (since - since_mean)))
+    offset = float(mean - slope * since_mean)
+    rest = relative - slope * since - offset
+    error = float(rest.std()) / (float(since.std()) * math.sqrt(len(lags)))
+    growth = abs(slope) * float(np.ptp(since))
+    if growth < options.min_drift * SECOND or abs(slope) < options.min_deviations * error:
+        return unchanged
+    low, high = np.percentile(rest, (5, 95))
+    return _Lag(median + round(offset), unchanged.spread, slope, float(high - low), centre)
 
 
-def _lag_of_poses(log: LogSource, options: ClockOptions) -> int | None:
-    """Return by how much poses are logged after their stamps (ns); None where there are none with a steady clock."""
-    for content in MOVING:
-        for topic in log.holding(content):
-            if topic.name.endswith("tf_static"):
-                continue
-            times = _times(log, topic, options.sampled)
-            if len(times[0]) and times[1].any():
-                lag, spread = _lag(*times)
-                if spread <= options.steady * SECOND:
-                    return lag
+def _moving_topics(log: LogSource) -> list[Topic]:
+    """Return the topics whose stamps say when the robot was where."""
+    return [topic for content in MOVING for topic in log.holding(content) if not topic.name.endswith("tf_static")]
+
+
+def _lag_of_poses(log: LogSource, options: ClockOptions) -> _Lag | None:
+    """Return by how much poses are logged after their stamps; None where there are none with a steady clock."""
+    for topic in _moving_topics(log):
+        times = _times(log, topic, options.sampled)
+        if len(times[0]) and times[1].any():
+            lag = _find_lag(*times, options)
+            if lag.spread <= options.steady * SECOND:
+                return lag
     return None
 
 

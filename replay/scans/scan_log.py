@@ -108,7 +108,7 @@ class ScanLog:
         self.topics, self._topic_notes = choose_scan_topics(log, options.topics)
         self.log = log
         self.unusable: dict[int, str] = {}
-        self._reconciled: set[int] = set()
+        self._contradictions: dict[str, set[int]] = {}
         self._offsets: Stamps | None = None
         self._is_reversed = False
         self._iterated: NDArray[np.intp] | None = None
@@ -122,9 +122,9 @@ class ScanLog:
         numbers, scanner, stamps = self._read_stamps(options.clock)
         self.total = len(stamps)
         selected = selection.select(stamps) if self.total else np.zeros(0, dtype=np.intp)
+        if not self.total:
+            raise LogReadError(log.path, f"no scan on {self.names} can be decoded", "; ".join(log.lost))
         if not len(selected):
-            if not self.total:
-                raise LogReadError(log.path, f"no scan on {self.names} has a header that can be read")
             span = (stamps.max() - stamps.min()) / 1e9
             what = f"no scan is selected of the {self.total} on {self.names} ({span:.1f} s in all)"
             raise LogReadError(log.path, what, "begin with the first one: --start 0")
@@ -212,9 +212,9 @@ class ScanLog:
     def _as_scan(self, number: int, topic: str, value: Any) -> Scan:
         """Return a message's scan; its angles are those of its ends where its increment contradicts these."""
         scan: Scan = self._slicers[topic].scan(value) if topic in self._slicers else value
-        reconciled = reconciled_angles(scan)
-        if reconciled is not scan:
-            self._reconciled.add(number)
+        reconciled, contradiction = reconciled_angles(scan)
+        if contradiction is not None:
+            self._contradictions.setdefault(contradiction, set()).add(number)
         return reconciled
 
     def _with_times(self, scan: Scan, scanner: int) -> Scan:
@@ -233,11 +233,7 @@ class ScanLog:
             for scanner in self.scanners
             if scanner.given_sweep and not scanner.sweep and math.isfinite(scanner.given_sweep)
         ]
-        if self._reconciled:
-            notes.append(
-                f"angle_increment contradicts angle_min and angle_max in {pluralize(len(self._reconciled), 'scan')}: "
-                "beams are spread evenly between these"
-            )
+        notes += [what.format(pluralize(len(scans), "scan")) for what, scans in self._contradictions.items()]
         return notes + self._irregularities()
 
     def _irregularities(self) -> list[str]:
@@ -268,7 +264,7 @@ class ScanLog:
             if (scanner == k).any()
         }
         if times:
-            found = find_clock(self.log, self.topics, times, clock)
+            found = find_clock(self.log, times, clock)
             self.log = on_clock(self.log, found)
             if not found.keeps_headers:
                 names = [topic.name for topic in self.topics]

@@ -311,6 +311,7 @@ SUGGESTING = ("prim/log", "replay/scans", "replay/poses", "replay/mapping_stage.
 ELSEWHERE = {
     "--compass-topic": "as --gps-topic",
     "--no-deskew": "as --sweep",
+    "--keep": "of gzip and zstd: tests/prim/log/test_log_file.py",
     "--bounds": "what the user knows",
 }
 """Options that are suggested and not given here, and why."""

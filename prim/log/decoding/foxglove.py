@@ -8,7 +8,7 @@ from __future__ import annotations
 import base64
 import math
 from collections.abc import Callable
-from datetime import datetime
+from datetime import UTC, datetime
 from typing import Any
 
 import numpy as np
@@ -17,9 +17,16 @@ from prim import strict_json
 from prim.log.decoding.cdr import SECOND
 from prim.log.decoding.values import PointCloud, StampedPose, StampedVector, checked_stamp, planar_pose
 from prim.scan import Scan
+from prim.se2 import Pose2D
 
 NUMPY_TYPES = {1: "u1", 2: "i1", 3: "u2", 4: "i2", 5: "u4", 6: "i4", 7: "f4", 8: "f8"}
 """The numeric types of foxglove.PackedElementField, and what they mean to NumPy."""
+
+NUMERIC_TYPES = {
+    name: number
+    for number, name in enumerate(("UINT8", "INT8", "UINT16", "INT16", "UINT32", "INT32", "FLOAT32", "FLOAT64"), 1)
+}
+"""Their names, as protobuf's own JSON has them."""
 
 MAX_SHIFT = 1e-6
 """A laser's origin farther than this (m) from its frame's is not at it."""
@@ -61,12 +68,21 @@ class _Missing(JsonFields):
         return False
 
 
+class _Null(_Missing):
+    """A field that is null: a number that is NaN, else as one that is not there."""
+
+    def __float__(self) -> float:
+        return math.nan
+
+
 def _as_fields(value: Any) -> Any:
+    if value is None:
+        return _Null()
     if isinstance(value, dict):
         return JsonFields(value)
     if isinstance(value, list) and value and isinstance(value[0], dict):
         return [_as_fields(item) for item in value]
-    return math.nan if value is None else value
+    return value
 
 
 def parse_json(data: bytes) -> Any:
@@ -122,6 +138,9 @@ def _message_type(name: str) -> Any:
 
 def read_scan(message: Any) -> Scan:
     """Read a foxglove.LaserScan: without limits of the range, and without the time of a sweep."""
+    absent = [name for name in ("start_angle", "end_angle", "ranges") if type(getattr(message, name)) is _Missing]
+    if absent:
+        raise ValueError(f"a scan without {absent[0]}")
     ranges = np.array([_number(z) for z in message.ranges] if _is_json(message) else message.ranges, dtype=np.float32)
     first, last = float(message.start_angle), float(message.end_angle)
     increment = (last - first) / (len(ranges) - 1) if len(ranges) > 1 else 0.0
@@ -148,31 +167,37 @@ def _turn_of_origin(message: Any) -> float:
 
 def read_cloud(message: Any) -> PointCloud:
     """Read a foxglove.PointCloud that has x, y and, unless it is flat, z."""
-    data = base64.b64decode(message.data) if isinstance(message.data, str) else bytes(message.data)
+    turn = _turn_of_origin(message)
+    data = base64.b64decode(message.data, validate=True) if isinstance(message.data, str) else bytes(message.data)
     stride = int(message.point_stride)
-    fields = {str(field.name): (int(field.offset), int(field.type)) for field in message.fields}
+    fields = {str(field.name): (int(field.offset), _numeric_type(field.type)) for field in message.fields}
     if stride < 1 or len({"x", "y"} & fields.keys()) < 2:
         raise ValueError("a cloud without x and y")
     points = np.zeros((len(data) // stride, 3))
     for k, axis in enumerate("xyz"):
         if axis in fields and len(points):
             offset, kind = fields[axis]
-            if kind not in NUMPY_TYPES or offset + np.dtype(NUMPY_TYPES[kind]).itemsize > stride:
+            if kind not in NUMPY_TYPES or offset < 0 or offset + np.dtype(NUMPY_TYPES[kind]).itemsize > stride:
                 raise ValueError(f"{axis} of a cloud cannot be read")
             points[:, k] = np.ndarray(len(points), "<" + NUMPY_TYPES[kind], data, offset, (stride,))
+    points[:, :2] = Pose2D(0.0, 0.0, turn).apply(points[:, :2])
     return PointCloud(read_stamp(message), str(message.frame_id), points)
+
+
+def _numeric_type(value: Any) -> int:
+    """Return a numeric type, which JSON may name."""
+    return NUMERIC_TYPES.get(value, 0) if isinstance(value, str) else int(value)
 
 
 def read_transform(message: Any) -> list[StampedPose]:
     """Read a foxglove.FrameTransform."""
-    rotation = message.rotation
     return [
         StampedPose(
             read_stamp(message),
             str(message.parent_frame_id),
             str(message.child_frame_id),
             _xyz(message.translation),
-            (*_xyz(rotation), _number(rotation.w)),
+            _rotation(message.rotation),
         )
     ]
 
@@ -196,11 +221,19 @@ def read_fix(message: Any) -> StampedVector:
 def read_stamp(message: Any) -> int:
     """Read a message's timestamp (ns)."""
     stamp = message.timestamp
+    if isinstance(stamp, _Missing):
+        return 0
     if isinstance(stamp, str):  # as protobuf's own JSON has it (RFC 3339)
-        return round(datetime.fromisoformat(stamp).timestamp() * SECOND)
-    if isinstance(stamp, JsonFields):
-        return checked_stamp(int(stamp.sec) * SECOND + int(stamp.nsec))
-    return checked_stamp(int(stamp.seconds) * SECOND + int(stamp.nanos))
+        time = datetime.fromisoformat(stamp)
+        return round((time if time.tzinfo else time.replace(tzinfo=UTC)).timestamp() * SECOND)
+    if not isinstance(stamp, JsonFields):
+        if not hasattr(stamp, "nanos"):
+            raise ValueError(f"its timestamp, {stamp!r}, is none of seconds and nanoseconds")
+        return checked_stamp(int(stamp.seconds) * SECOND + int(stamp.nanos))
+    for seconds, nanoseconds in ((stamp.sec, stamp.nsec), (stamp.sec, stamp.nanosec), (stamp.seconds, stamp.nanos)):
+        if not isinstance(seconds, _Missing) and not isinstance(nanoseconds, _Missing):
+            return checked_stamp(int(seconds) * SECOND + int(nanoseconds))
+    raise ValueError("its timestamp has no sec and nsec")
 
 
 def first_stamp(message: Any) -> int:
@@ -209,8 +242,11 @@ def first_stamp(message: Any) -> int:
 
 
 def _pose(pose: Any, stamp: int, frame_id: str, child_frame_id: str) -> StampedPose:
-    rotation = pose.orientation
-    return StampedPose(stamp, frame_id, child_frame_id, _xyz(pose.position), (*_xyz(rotation), _number(rotation.w)))
+    return StampedPose(stamp, frame_id, child_frame_id, _xyz(pose.position), _rotation(pose.orientation))
+
+
+def _rotation(quaternion: Any) -> tuple[float, float, float, float]:
+    return (*_xyz(quaternion), _number(quaternion.w))
 
 
 def _xyz(vector: Any) -> tuple[float, float, float]:
@@ -222,7 +258,8 @@ def _number(value: Any) -> float:
     try:
         return math.nan if value is None else float(value)
     except TypeError as error:
-        raise ValueError(f"{value!r} is no number") from error
+        what = "an object" if isinstance(value, dict | JsonFields) else repr(value)
+        raise ValueError(f"{what} is no number") from error
 
 
 def _is_json(message: Any) -> bool:

@@ -10,7 +10,8 @@ import pytest
 
 from prim.log import open_log
 from prim.log.decoding.ros import decode_scan
-from prim.log.messages import ODOM_TOPIC, SCAN_TOPIC, encode_scan
+from prim.log.decoding.values import planar_pose
+from prim.log.messages import ODOM_TOPIC, SCAN_TOPIC, TF_TOPIC, encode_odometry, encode_scan, encode_transforms
 from prim.log.source import Message
 from prim.log.time_resets import find_shifts, moved_behind_resets
 from replay.poses.laser_poses import LaserPoses
@@ -81,6 +82,64 @@ def test_stamps_of_zero_are_those_of_the_log(content: LogContent, expected: Lase
     assert both.sum() >= len(both) - 2
     assert np.abs(poses.poses - expected.poses)[both].max() < 5e-3
     assert "are 0" in notes[0]
+
+
+@pytest.mark.parametrize("share", [2, 7])
+def test_single_stamps_of_zero_are_those_of_the_log(
+    content: LogContent, expected: LaserPoses, tmp_path: Path, share: int
+) -> None:
+    """The others remain, on whatever clock they are."""
+    for back in (0, YEARS):
+        some = stamped(content, lambda stamp, back=back: stamp // 10**8 % share * (stamp - back) and stamp - back)
+        poses, notes = located(some, tmp_path)
+        both = poses.valid & expected.valid
+        assert both.sum() >= len(both) - 2
+        assert np.abs(poses.poses - expected.poses)[both].max() < 1e-3
+        assert re.search(r"\d+ of 30 stamps of /scan are 0", notes[-1])
+
+
+@pytest.mark.parametrize("back", [0, YEARS])
+@pytest.mark.parametrize("drift", [0.01, -0.02])
+def test_a_clock_that_runs_fast_or_slow_is_set(
+    content: LogContent, expected: LaserPoses, tmp_path: Path, back: int, drift: float
+) -> None:
+    """Of thirty scans in 3 s, the drift is found to the jitter of the log times."""
+    start = decode_scan(content.of(SCAN_TOPIC)[0].data).stamp
+    drift *= 1 if back else 20
+    poses, notes = located(stamped(content, lambda stamp: stamp - back + round((stamp - start) * drift)), tmp_path)
+    both = poses.valid & expected.valid
+    assert both.sum() >= len(both) - 2
+    assert np.abs(poses.poses - expected.poses)[both].max() < 1e-3
+    assert ("fast" if drift > 0 else "slow") in notes[0]
+
+
+@pytest.mark.parametrize("stamp_of", [lambda stamp: 0, lambda stamp: stamp - YEARS], ids=["zero", "device"])
+@pytest.mark.parametrize("topic", [ODOM_TOPIC, TF_TOPIC])
+def test_poses_on_another_clock_are_moved_onto_that_of_the_scans(
+    content: LogContent, tmp_path: Path, topic: str, stamp_of: Callable[[int], int]
+) -> None:
+    def changed(message: Message) -> Message:
+        if message.topic != topic:
+            return message
+        (pose,) = decode_poses(content.types[topic], message.data)
+        plane = planar_pose(pose)
+        stamp = stamp_of(pose.stamp)
+        if topic == ODOM_TOPIC:
+            return message._replace(data=encode_odometry(stamp, plane))
+        return message._replace(data=encode_transforms([(stamp, pose.frame_id, pose.child_frame_id, plane)]))
+
+    plain = without_truth(content)
+    source = "odom" if topic == ODOM_TOPIC else "tf"
+    found = []
+    for messages in (plain.messages, tuple(map(changed, plain.messages))):
+        with open_log(ros2.write_mcap(replace(plain, messages=messages), tmp_path)) as log:
+            scans = ScanLog(log, Selection())
+            found.append((PoseProvider(scans.log).laser_poses(scans.times, source), scans.notes()))
+    (right, silent), (poses, notes) = found
+    both = right.valid & poses.valid
+    assert not silent and any(topic in note for note in notes)
+    assert both.sum() >= len(both) - 2
+    assert np.abs(poses.poses - right.poses)[both].max() < 5e-3
 
 
 def test_the_choice_of_a_clock_is_kept(content: LogContent, tmp_path: Path) -> None:

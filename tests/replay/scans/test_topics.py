@@ -105,6 +105,10 @@ def test_one_offset_is_not_that_of_two_scanners(tmp_path: Path) -> None:
         (1, 359 - 360, 1),
         (-1, 1, -1),
         (0.5, 179.5, 0.5),
+        (0.5, 359, 1),
+        (1e-7, 359, 1),
+        (1, 361 * 57, 1),
+        (-1, 360, 360 / 359),
     ],
 )
 def test_angles_are_those_of_the_ends_where_the_increment_contradicts(
@@ -112,4 +116,35 @@ def test_angles_are_those_of_the_ends_where_the_increment_contradicts(
 ) -> None:
     """Degrees, of 360 beams; ends that were wrapped contradict nothing, nor does one beam more or less."""
     scan = Scan(0, "", 0.0, np.radians(increment), 0.1, 5.0, np.ones(360, np.float32), angle_max=np.radians(last))
-    assert reconciled_angles(scan).angle_increment == pytest.approx(np.radians(expected))
+    assert reconciled_angles(scan)[0].angle_increment == pytest.approx(np.radians(expected))
+
+
+@pytest.mark.parametrize(
+    ("first", "last", "increment", "beams", "used", "what"),
+    [
+        (-180, 0, 1, 360, 1, "angle_max contradicts"),
+        (-180, 360, 1, 360, 1, "angle_max contradicts"),
+        (-90, 90, 1, 100, 1, "fewer ranges"),
+        (-90, 90, 1, 171, 1, "fewer ranges"),
+        (-90, 90, 0.5, 181, 1, "angle_increment contradicts"),
+        (-90, 90, 1, 91, 2, "angle_increment contradicts"),
+        (-90, 90, 2, 181, 1, "angle_increment contradicts"),
+        (-90, 90, 0.97, 181, 1, "angle_increment contradicts"),
+    ],
+)
+def test_the_increment_remains_where_the_ends_cannot_be(
+    first: float, last: float, increment: float, beams: int, used: float, what: str
+) -> None:
+    """Degrees."""
+    first, last, increment = np.radians((first, last, increment)).tolist()
+    scan = Scan(0, "", first, increment, 0.1, 5.0, np.ones(beams, np.float32), angle_max=last)
+    reconciled, contradiction = reconciled_angles(scan)
+    assert reconciled.angle_increment == pytest.approx(np.radians(used))
+    assert contradiction is not None and contradiction.startswith((what, f"there are {what}"))
+
+
+@pytest.mark.parametrize(("first", "increment"), [(-np.pi, 0.0), (-180.0, 1.0), (-180.0, np.pi / 180)])
+def test_angles_that_no_beam_can_have_make_a_scan_unusable(first: float, increment: float) -> None:
+    scan = Scan(0, "", first, increment, 0.1, 5.0, np.ones(360, np.float32), angle_max=first)
+    problem = reconciled_angles(scan)[0].problem
+    assert problem is not None and problem.startswith(f"angle_{'min' if increment else 'increment'}")
