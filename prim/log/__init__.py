@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -76,9 +77,11 @@ def _opener(file: LogFile) -> Callable[[LogFile, bool], LogReader]:
             return open_source
     for magic, (what, hint) in _UNSUPPORTED.items():
         if file.head.startswith(magic):
-            raise LogReadError(file.path, f"{what}, not a log", hint.format(file.path))
+            raise LogReadError(file.path, f"{what}, not a log", hint.format(shlex.quote(str(file.path))))
     if file.head[TAR_AT:].startswith(TAR_MAGIC):
-        raise LogReadError(file.path, "a tar archive, not a log", f"unpack it with: tar -xf {file.path}")
+        raise LogReadError(
+            file.path, "a tar archive, not a log", f"unpack it with: tar -xf {shlex.quote(str(file.path))}"
+        )
     if not file.head:
         raise LogReadError(file.path, "an empty file (0 bytes)", _KNOWN)
     from prim.log import carmen

@@ -249,7 +249,9 @@ def make_detection_stage(
     weights = options.weights or shipped_weights(options.mapper)
     try:
         if weights is None:
-            raise UsageError(f"no weights for maps of {options.mapper} come with prim: give --weights")
+            raise UsageError(
+                f"no weights for maps of {options.mapper} come with prim: give --weights, or --no-detect"
+            )
         detector = _load(weights, options.mapper, timer)
         return DetectionStage(detector, options, frame, posed_scans, truth, is_shown, timer)
     except (UsageError, WeightsError) as error:

@@ -67,12 +67,14 @@ class ScanTimes:
         sweeps: For each laser the time (ns) from a scan's first beam to its last, negative where they run against
             time; 0: all beams are taken at once. Empty: 0 for all.
         scanner: By which laser each scan was taken (N,); None: by the only one.
+        topics: The topic of each laser's scans; empty where there is one laser.
     """
 
     stamps: Stamps
     frame_ids: tuple[str, ...]
     sweeps: tuple[int, ...] = ()
     scanner: NDArray[np.intp] | None = None
+    topics: tuple[str, ...] = ()
 
     @property
     def query_stamps(self) -> Stamps:

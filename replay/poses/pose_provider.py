@@ -20,6 +20,7 @@ from replay.poses.fusion_options import COMPASS, GPS, ODOM, FusionInputs, Fusion
 from replay.poses.laser_poses import FUSED, STILL, FusedSensor, LaserPoses, ScanTimes
 from replay.poses.mount import SensorMounts, assumed_note
 from replay.poses.sensors import (
+    REST_HINT,
     SensorLogs,
     compass_headings,
     find_compass,
@@ -30,6 +31,9 @@ from replay.poses.sensors import (
     read_sensors,
 )
 from replay.poses.transforms import project_to_plane
+
+OTHER_POSES = "take what poses there are: --pose auto"
+"""What helps where a source of poses is not there."""
 
 
 @dataclass(frozen=True)
@@ -116,7 +120,7 @@ class PoseProvider:
             raise LogReadError(
                 self._log.path,
                 f"no scan (stamps {first:.3f} to {last:.3f} s) lies within the time of the poses on {poses.origin}",
-                "two clocks in one log? give another --pose or --odom-topic",
+                "two clocks in one log? by when messages were logged: --clock log",
             )
         return poses
 
@@ -179,9 +183,7 @@ class PoseProvider:
 
     def _from_truth(self, scans: ScanTimes) -> LaserPoses:
         if not self.has_truth:
-            raise LogReadError(
-                self._log.path, f"no ground truth: there is no {TRUE_POSE_TOPIC}", "give another --pose"
-            )
+            raise LogReadError(self._log.path, f"no ground truth: there is no {TRUE_POSE_TOPIC}", OTHER_POSES)
         return self._from_topic(scans, self._log.topics[TRUE_POSE_TOPIC], "truth")
 
     def _from_odometry(self, scans: ScanTimes, source: str) -> LaserPoses:
@@ -195,7 +197,7 @@ class PoseProvider:
                     [
                         *self._mounts.tree_notes,
                         *self._log.lost,
-                        "to map with the robot at rest give --standing-still",
+                        REST_HINT,
                     ]
                 ),
             )
@@ -234,7 +236,7 @@ class PoseProvider:
         roots = sorted({origin.split(" > ")[0] for origin in origins})
         if len(roots) > 1:
             what = f"tf has the scanners in different fixed frames ({', '.join(roots)})"
-            raise LogReadError(self._log.path, what, "choose one scanner with --scan-topic")
+            raise LogReadError(self._log.path, what, f"choose one scanner with --scan-topic {scans.topics[0]}")
         notes += tuple(f"{frame} has several parents in tf: {parent} is used" for frame, parent in tree.conflicts)
         unique = tuple(dict.fromkeys(notes))
         return LaserPoses("tf", ", ".join(origins), poses, valid, upside_down, unique, mount_assumed=assumed)
@@ -251,7 +253,7 @@ class PoseProvider:
             tree = self._mounts.tree
             frames = ", ".join(sorted({*tree.edges, *tree.parents}))
             what = f"tf has no chain from {name!r} to a fixed frame (its frames: {frames or 'none'})"
-            raise LogReadError(self._log.path, what, "give another --pose")
+            raise LogReadError(self._log.path, what, OTHER_POSES)
         robot_chain = self._mounts.fixed_chain(robot)
         if offset is not None:
             return _TfLink(robot_chain, np.array([[offset.x, offset.y, offset.theta]]))
@@ -291,7 +293,7 @@ class PoseProvider:
             raise LogReadError(
                 self._log.path,
                 f"fused poses need odometry, or a GPS and a compass: there is {sensors.topics or 'none of them'}",
-                "give another --pose, or the topics by --odom-topic, --gps-topic and --compass-topic",
+                OTHER_POSES,
             )
         base = (sensors.odometry.base_frame if sensors.odometry else "") or BASE_FRAME
         nodes = self._nodes(scans, base, sensors)
@@ -335,7 +337,9 @@ class PoseProvider:
             )
         except ValueError:
             what = f"no scan lies within the time of {sensors.topics}"
-            raise LogReadError(self._log.path, what, "two clocks in one log? give another --pose") from None
+            raise LogReadError(
+                self._log.path, what, "two clocks in one log? by when messages were logged: --clock log"
+            ) from None
 
     def _gap_note(self, what: str, poses: Stamps, scans: Stamps) -> tuple[str, ...]:
         """Return a note where scans (stamps in ns) lie between poses that are far apart in time."""

@@ -20,6 +20,9 @@ from replay.poses.transforms import is_valid_pose
 
 GPS_CONTENTS = (Content.POINT, Content.FIX)
 COMPASS_CONTENTS = (Content.VECTOR,)
+REST_HINT = "to map with the robot at rest give --standing-still"
+"""What helps where there are no poses."""
+
 POSE_CONTENTS = (Content.ODOMETRY, Content.POSE)
 """What may be the robot's poses."""
 
@@ -155,7 +158,7 @@ def find_pose_topic(log: LogSource, requested: str | None = None) -> Topic | Non
     odometry = [topic for topic in topics if topic.content is Content.ODOMETRY] or topics
     if len(odometry) > 1:
         what = f"poses on {len(odometry)} topics: {', '.join(topic.name for topic in odometry)}"
-        raise LogReadError(log.path, what, "choose one with --odom-topic")
+        raise LogReadError(log.path, what, f"choose one with --odom-topic {odometry[0].name}")
     return odometry[0] if odometry else None
 
 
@@ -203,7 +206,7 @@ def read_odometry(log: LogSource, topic: Topic) -> OdometryLog:
             else:
                 skipped += 1
     if not stamps:
-        raise LogReadError(log.path, f"{topic.name} has no usable pose", "give another --pose")
+        raise LogReadError(log.path, f"{topic.name} has no usable pose", REST_HINT)
     return OdometryLog(topic.name, Trajectory.from_unsorted(stamps, poses), base_frame, skipped)
 
 
@@ -254,7 +257,9 @@ def _find(
     likely = [topic for topic in topics if not set(names).isdisjoint(re.split(r"[/_]", topic.name.lower()))]
     if len(likely) > 1:
         listed = ", ".join(topic.name for topic in likely)
-        raise LogReadError(log.path, f"{len(likely)} topics to choose from: {listed}", f"choose one with {option}")
+        raise LogReadError(
+            log.path, f"{len(likely)} topics to choose from: {listed}", f"choose one with {option} {likely[0].name}"
+        )
     return likely[0] if likely else None
 
 

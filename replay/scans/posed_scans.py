@@ -56,7 +56,7 @@ class PosedScans:
         self.poses = poses
         self._options = options
         self._timer = timer or StageTimer()
-        self._endless = False
+        self._endless, self._farthest = False, 0.0
 
     def __iter__(self) -> Iterator[PosedScan]:
         """Iterate over the scans that have a pose, in the order of the log."""
@@ -72,7 +72,8 @@ class PosedScans:
         notes = [*self.poses.notes, *self.scan_log.notes()]
         if self._endless:
             notes.append(
-                "the log gives no longest range: beams without a return say nothing; if it is known, give --max-range"
+                "the log gives no longest range: beams without a return say nothing; if it is known, give it, as in "
+                f"--max-range {math.ceil(self._farthest)}, which is as far as any beam returned from"
             )
         outside = int(np.count_nonzero(~self.poses.valid))
         if outside:
@@ -87,5 +88,6 @@ class PosedScans:
         if math.isinf(scan.range_max):  # how far it is free where nothing returned is not known
             endless = np.isposinf(scan.ranges)
             self._endless |= bool(endless.any())
+            self._farthest = max(self._farthest, float(np.max(scan.ranges, where=scan.measured, initial=0.0)))
             scan = replace(scan, ranges=np.where(endless, np.float32(np.nan), scan.ranges))
         return mirror_scan(scan) if self.poses.is_upside_down(position) else scan

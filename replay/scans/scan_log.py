@@ -125,9 +125,9 @@ class ScanLog:
         if not self.total:
             raise LogReadError(log.path, f"no scan on {self.names} can be decoded", "; ".join(log.lost))
         if not len(selected):
-            span = f"{(stamps.max() - stamps.min()) / 1e9:.1f} s"
-            what = f"no scan is selected of the {self.total} on {self.names} ({span} in all)"
-            raise LogReadError(log.path, what, "give another --start, --end or --duration")
+            span = (stamps.max() - stamps.min()) / 1e9
+            what = f"no scan is selected of the {self.total} on {self.names} ({span:.1f} s in all)"
+            raise LogReadError(log.path, what, "begin with the first one: --start 0")
         self._numbers = numbers[selected]
         self.stamps = stamps[selected]
         self.scanner = scanner[selected]
@@ -156,6 +156,7 @@ class ScanLog:
             tuple(scanner.first.frame_id for scanner in self.scanners),
             tuple(scanner.sweep for scanner in self.scanners),
             self.scanner,
+            tuple(scanner.topic.name for scanner in self.scanners),
         )
 
     @property
