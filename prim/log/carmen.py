@@ -10,6 +10,7 @@ import math
 import re
 from collections import Counter
 from collections.abc import Iterator
+from contextlib import suppress
 from typing import NamedTuple
 
 import numpy as np
@@ -24,8 +25,11 @@ from prim.log.source import Message, Topic
 from prim.scan import Scan
 from prim.se2 import Pose2D, wrap_angle
 
+BYTE_ORDER_MARK = b"\xef\xbb\xbf"
+"""How a text begins that an editor saved as UTF-8."""
+
 START = re.compile(
-    rb"(\s*(#[^\n]*)?\n)*\s*(PARAM|SYNC|ODOM|TRUEPOS|[FR]LASER|ROBOTLASER\d|RAWLASER\d|NMEAGGA|NMEARMC|NEFF)\s"
+    rb"(\xef\xbb\xbf)?(\s*(#[^\n]*)?\n)*\s*(PARAM|SYNC|ODOM|TRUEPOS|[FR]LASER|ROBOTLASER\d|RAWLASER\d|NMEAGGA|NMEARMC|NEFF)\s"
 )
 """How a log of CARMEN begins: behind comments and empty lines, with one of its messages."""
 
@@ -54,6 +58,14 @@ CONSTANT_MOUNT = (0.02, math.radians(1.0))
 
 MIN_MOUNT = (2e-3, math.radians(0.1))
 """A laser's pose within this (m, rad) of the robot's is the same pose: the log does not say where the laser is."""
+
+SAME_LASERS = {"FLASER": "ROBOTLASER1", "RLASER": "ROBOTLASER2"}
+"""Lines that newer versions write besides those of earlier ones, of the same scans."""
+
+_PARTNERS = SAME_LASERS | {full: plain for plain, full in SAME_LASERS.items()}
+
+REPEATED_SHARE = 0.9
+"""A kind of line repeats another one if this share of its scans has the time of one of that; set by hand."""
 
 COARSE_SHARE = 0.5
 """Where fewer than this share of the scans have a time of their own, times are too coarse to be used."""
@@ -127,6 +139,19 @@ class _Mount:
         return math.hypot(mean.x, mean.y) > MIN_MOUNT[0] or abs(mean.theta) > MIN_MOUNT[1]
 
 
+class _Motion:
+    """Whether poses differ from each other."""
+
+    def __init__(self) -> None:
+        self.found = False
+        self._first: Pose2D | None = None
+
+    def add(self, pose: Pose2D) -> None:
+        """Add a pose."""
+        first = self._first = self._first or pose
+        self.found |= (pose.x, pose.y, pose.theta) != (first.x, first.y, first.theta)
+
+
 class CarmenReader(LogReader):
     """A log of CARMEN that is open for reading: a :class:`prim.log.source.LogSource`.
 
@@ -152,6 +177,7 @@ class CarmenReader(LogReader):
         self._max_range: dict[str, float] = {}
         self._counts: Counter[str] = Counter()
         self._mounts: dict[str, _Mount] = {}
+        self._repeated: Counter[str] = Counter()
         self._first_time = 0
         self._even_times = False
         try:
@@ -167,33 +193,49 @@ class CarmenReader(LogReader):
 
     def _survey(self) -> None:
         """Read all lines once: count them, and find the parameters, the mounts of the lasers, and usable times."""
-        stamps: set[str] = set()
+        stamps: dict[str, str] = {}
+        distinct = 0
+        in_scans, in_odometry = _Motion(), _Motion()
         for line in self._lines():
             if line.name == "PARAM" and len(line.fields) >= 2:
                 self._read_parameter(*line.fields[:2])
             elif _is_topic(line.name):
                 self._counts[line.name] += 1
-                stamps.update(self._survey_scan(line))
+                stamp = self._survey_odometry(line, in_odometry) or self._survey_scan(line, in_scans)
+                distinct += bool(stamp) and stamp != stamps.get(line.name)
+                stamps[line.name] = stamp
+                self._repeated[line.name] += bool(stamp) and stamp == stamps.get(_PARTNERS.get(line.name, ""))
         scans = sum(count for name, count in self._counts.items() if name != ODOM)
-        self._even_times = scans > 1 and len(stamps) < COARSE_SHARE * scans
+        self._even_times = scans > 1 and distinct < COARSE_SHARE * scans
         if self._even_times:
             step = SPACING / SECOND
-            self.notes = [
-                f"its times are too coarse ({len(stamps)} for {scans} scans): scans are taken to be {step:g} s apart"
-            ]
+            self.notes.append(
+                f"its times are too coarse ({distinct} for {scans} scans): scans are taken to be {step:g} s apart"
+            )
+        if self._mounts and in_odometry.found and not in_scans.found:
+            self._mounts.clear()
+            self.notes.append(f"the poses in the lines of scans are all the same: those of {ODOM} are used")
 
-    def _survey_scan(self, line: _Line) -> list[str]:
-        """Take note of a scan's mount and of the time of the first one; return its stamp."""
+    def _survey_odometry(self, line: _Line, motion: _Motion) -> str:
+        """Take note of motion in a line of odometry; return nothing."""
+        if line.name == ODOM and not motion.found:
+            with suppress(ValueError):  # an error, or a loss, when it is decoded
+                motion.add(_odometry_line(line)[0])
+        return ""
+
+    def _survey_scan(self, line: _Line, motion: _Motion) -> str:
+        """Take note of a scan's mount and of the time of the first one; return its stamp, empty without one."""
         if line.name == ODOM:
-            return []
+            return ""
         try:
             scan = _laser_line(line)
             self._first_time = self._first_time or _nanoseconds(scan.stamp)
         except ValueError:
-            return []  # an error, or a loss, when it is decoded
+            return ""  # an error, or a loss, when it is decoded
         if scan.laser_pose is not None and scan.robot_pose is not None:
             self._mounts.setdefault(line.name, _Mount()).add(scan.robot_pose.inverse() @ scan.laser_pose)
-        return [scan.stamp]
+            motion.add(scan.robot_pose)
+        return scan.stamp
 
     def _read_parameter(self, name: str, value: str) -> None:
         for laser, names in MAX_RANGE_PARAMETERS.items():
@@ -203,8 +245,10 @@ class CarmenReader(LogReader):
     def _find_topics(self) -> dict[str, Topic]:
         topics = []
         for name, count in self._counts.items():
-            content = Content.SCAN
-            if name == ODOM:  # the poses in the lines of scans are those of their times
+            content: Content | None = Content.SCAN
+            if self._is_repeated(name):
+                content = None
+            elif name == ODOM:  # the poses in the lines of scans are those of their times
                 content = Content.POSE if self._mounts else Content.ODOMETRY
             topics.append(Topic(name, name, "carmen", count, content))
         if self._mounts:
@@ -214,14 +258,21 @@ class CarmenReader(LogReader):
             topics.append(Topic(ROBOT_POSES, "robot pose", "carmen", poses, robot))
             if not constant:
                 topics.append(Topic(CORRECTED_POSES, "laser pose", "carmen", poses, Content.ODOMETRY))
-                self.notes = [
-                    *self.notes,
+                self.notes += [
                     "the laser's poses are no constant offset from the robot's: they are taken to be corrected ones; "
                     f"for the robot's own give --odom-topic {ROBOT_POSES}",
                 ]
             elif any(mount.differs for mount in self._mounts.values()):
                 topics.append(Topic(STATIC_TRANSFORMS, "laser mount", "carmen", 1, Content.TRANSFORMS))
         return {topic.name: topic for topic in topics}
+
+    def _is_repeated(self, name: str) -> bool:
+        """Return whether the scans of a kind of line are those of another one, and note that."""
+        other = SAME_LASERS.get(name)
+        if other is None or self._repeated[name] + self._repeated[other] < REPEATED_SHARE * self._counts[name]:
+            return False
+        self.notes.append(f"{name} has the scans of {other} once more: they are not used")
+        return True
 
     def messages(self, *topics: str) -> Iterator[Message]:
         """See :meth:`prim.log.source.LogSource.messages`; the data of a message is its line."""
@@ -259,7 +310,8 @@ class CarmenReader(LogReader):
             if not lines:
                 return
             for line in lines:
-                name, *fields = line.decode("utf-8", "replace").split() or ["#"]
+                text = line.removeprefix(BYTE_ORDER_MARK).decode("utf-8", "replace")
+                name, *fields = text.split() or ["#"]
                 if not name.startswith("#"):
                     yield _Line(name, fields)
 

@@ -102,19 +102,31 @@ class SensorMounts:
             return name, ()
         leaves = [child for child in tree.edges if child not in tree.parents and tree.edges[child][1].static]
         likely = [leaf for leaf in leaves if LASER_WORDS.search(leaf)]
-        possible = likely if likely or name else [leaf for leaf in leaves if not OTHER_WORDS.search(leaf)]
+        possible = likely or [
+            leaf for leaf in leaves if not OTHER_WORDS.search(leaf) and leaf.rpartition("/")[2] not in ROBOT_FRAMES
+        ]
         if len(possible) != 1:
             return name, ()
         unknown = f"tf does not have the scans' frame {name}" if name else "the scans name no frame"
         return possible[0], (f"{unknown}: they are taken to be in {possible[0]}, which alone can be a scanner's",)
 
-    def robot_frame(self) -> str | None:
-        """Return the robot's frame in tf: one that moves in a fixed frame; None where there is none, or several."""
+    def robot_frame(self, scanner: str) -> str | None:
+        """Return the robot's frame in tf: one that moves in a fixed frame; None where there is none, or several.
+
+        Args:
+            scanner: The frame of a scanner. Of several robots it is on the one whose frames begin with the same name.
+
+        Returns:
+            The frame.
+        """
         tree = self.tree
         moving = [child for child in tree.edges if len(self.fixed_chain(child)) > 1]
         named = [frame for frame in ROBOT_FRAMES if frame in moving]
         driven = [child for child in moving if not tree.edges[child][1].static and child not in FIXED_FRAMES]
         first = [child for child in driven if not {*tree.chain(child)[1:]} & {*driven}]
+        if len(first) > 1 and not named:
+            robot = scanner.lstrip("/").rpartition("/")[0]
+            first = [child for child in first if robot and child.startswith(f"{robot}/")]
         return named[0] if named else first[0] if len(first) == 1 else None
 
     def sensor_mount(self, frame: str, base: str) -> tuple[FloatArray, FloatArray]:
@@ -138,7 +150,8 @@ class SensorMounts:
 
         Args:
             scans: When poses are asked for, and the lasers' frames.
-            base: The robot's frame.
+            base: The robot's frame; empty where nothing names it: BASE_FRAME, or what all static transforms from the
+                laser lead to.
 
         Returns:
             Its poses, and what was assumed.
@@ -151,6 +164,7 @@ class SensorMounts:
         poses, upside_down = np.zeros((len(stamps), 3)), np.zeros(len(stamps), dtype=bool)
         notes: tuple[str, ...] = ()
         assumed = False
+        base = base or self._base_of(scans.frame_ids[0])
         for k, name in enumerate(scans.frame_ids):
             rows = scans.query_rows(k)
             frame, renamed = self._mounted_frame(name, base)
@@ -166,6 +180,11 @@ class SensorMounts:
                 assumed = True
                 notes += (assumed_note(base, frame),)
         return LaserMounts(poses, upside_down, notes + self.tree_notes, assumed)
+
+    def _base_of(self, frame: str) -> str:
+        """Return the frame of the robot that carries a laser, as static transforms tell it."""
+        chain = self._static_tree.chain(frame)
+        return BASE_FRAME if BASE_FRAME in chain or len(chain) == 1 else chain[-1]
 
     def check_offset(self, scans: ScanTimes) -> None:
         """Check that an offset that is given is that of one laser. Raises UsageError."""

@@ -164,7 +164,7 @@ class PoseProvider:
                 if replace(self._inputs, noise=SensorNoise()) != FusionInputs():
                     raise
                 reason = (f"nothing is fused: {error.what}",)
-        use_tf = source == "tf" or all(len(chain) > 1 for chain in chains) or self._needs_robot_in_tf()
+        use_tf = source == "tf" or all(len(chain) > 1 for chain in chains) or self._needs_robot_in_tf(scans)
         poses = self._from_tf(scans, chains) if use_tf else self._from_odometry(scans, source)
         return replace(poses, notes=poses.notes + reason)
 
@@ -172,9 +172,9 @@ class PoseProvider:
         """Return the chain of frames from each laser up to a fixed frame; without one, its frame alone."""
         return [self._mounts.fixed_chain(self._mounts.scanner_frame(frame)[0]) for frame in scans.frame_ids]
 
-    def _needs_robot_in_tf(self) -> bool:
+    def _needs_robot_in_tf(self, scans: ScanTimes) -> bool:
         """Return whether tf has the robot, if not the laser, where no topic has its poses."""
-        if self._mounts.robot_frame() is None:
+        if self._mounts.robot_frame(scans.frame_ids[0]) is None:
             return False
         try:
             return find_pose_topic(self._log, self._odom_topic) is None
@@ -207,7 +207,7 @@ class PoseProvider:
         """Return the robot's poses on a topic, composed with the laser's mount."""
         odometry = read_odometry(self._log, topic)
         robot, valid = odometry.trajectory.at(scans.query_stamps)
-        mounts, upside_down, notes, assumed = self._mounts.laser_mounts(scans, odometry.base_frame or BASE_FRAME)
+        mounts, upside_down, notes, assumed = self._mounts.laser_mounts(scans, odometry.base_frame)
         notes += self._gap_note(topic.name, odometry.trajectory.stamps, scans.stamps) + odometry.notes
         poses = compose_poses(robot, mounts)
         several = mounts if len(scans.frame_ids) > 1 else None
@@ -215,7 +215,7 @@ class PoseProvider:
 
     def _from_tf(self, scans: ScanTimes, chains: Sequence[list[str]]) -> LaserPoses:
         """Return the lasers' poses in the fixed frame of tf: by their chains, else at the robot's frame."""
-        tree, robot = self._mounts.tree, self._mounts.robot_frame()
+        tree, robot = self._mounts.tree, self._mounts.robot_frame(scans.frame_ids[0])
         if self._mounts.tree_notes and not tree.edges:
             raise LogReadError(self._log.path, *self._mounts.tree_notes)
         self._mounts.check_offset(scans)

@@ -72,6 +72,15 @@ class TransformOptions:
     min_share: float = 0.15
     """They do so for at least this share of the transforms."""
 
+    rare_share: float = 0.02
+    """Or for this share, always by the same distance, where one of them publishes seldom."""
+
+    max_variation: float = 0.2
+    """Distances whose standard deviation is this share of their median are the same."""
+
+    min_jumps: int = 5
+    """Fewer such jumps may be chance."""
+
 
 DEFAULTS = TransformOptions()
 
@@ -273,9 +282,18 @@ def _disagreement(
     if not static:
         back_steps, back_turns = _apart(planar[2:], first)
         jumps &= back_steps + options.arm * back_turns <= options.max_return * length
-    if not jumps.any() or (not static and jumps.mean() < options.min_share):
+    if not jumps.any() or (not static and not _is_another_publisher(jumps, length, options)):
         return None
     return Disagreement(float(np.median(steps[jumps])), float(np.median(turns[jumps])), static)
+
+
+def _is_another_publisher(jumps: NDArray[np.bool_], length: FloatArray, options: TransformOptions) -> bool:
+    """Return whether jumps (N,) there and back are so many, or so much alike, that no noise makes them."""
+    if jumps.mean() >= options.min_share:
+        return True
+    found = length[jumps]
+    alike = float(found.std()) <= options.max_variation * float(np.median(found))
+    return jumps.mean() >= options.rare_share and len(found) >= options.min_jumps and alike
 
 
 def _planar(pose: StampedPose) -> tuple[float, float, float]:

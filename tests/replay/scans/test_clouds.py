@@ -64,3 +64,10 @@ def test_the_nearest_of_several_points_of_a_beam_counts() -> None:
 
 def test_an_empty_cloud_is_an_empty_scan() -> None:
     assert len(CloudSlicer(None, refuse).scan(PointCloud(0, "", np.zeros((0, 3)))).ranges) == 0
+
+
+def test_a_cloud_of_one_point_leaves_the_beams_to_later_ones() -> None:
+    slicer = CloudSlicer(None, refuse)
+    points = ring(180)
+    assert len(slicer.scan(PointCloud(0, "laser", points[:1])).ranges) == 0
+    assert len(slicer.scan(PointCloud(0, "laser", points)).ranges) == 180
