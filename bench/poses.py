@@ -35,7 +35,6 @@ from recorder.sensors import Lidar
 from recorder.session import SessionOptions, record_session
 from replay.options import ReplayOptions
 from replay.pipeline import Pipeline
-from replay.posed_scans import PosedScanOptions, PosedScans, ScanLog
 from replay.poses.fusion import Fusion
 from replay.poses.fusion_nodes import FusionNodes
 from replay.poses.fusion_options import SENSORS, FusionInputs, SensorNoise
@@ -43,7 +42,8 @@ from replay.poses.laser_poses import FUSED, LaserPoses
 from replay.poses.pose_provider import PoseProvider
 from replay.poses.scan_matching import match_scans
 from replay.result import ReplayResult
-from replay.selection import Selection
+from replay.scans.posed_scans import PosedScanOptions, PosedScans, ScanLog
+from replay.scans.selection import Selection
 
 SUBSETS = {
     "odometry, GPS, compass": SENSORS,
@@ -75,7 +75,7 @@ def fusion_errors(seed: int) -> Errors:
     """Return RMSE (m, rad) and NEES of each estimate, and the normalised errors of the map frame."""
     errors: Errors = {}
     with tempfile.TemporaryDirectory() as folder, open_log(driven(folder, seed, rays=16)) as log:
-        times = ScanLog(log, None, Selection()).times
+        times = ScanLog(log, Selection()).times
         truth = PoseProvider(log).laser_poses(times, "truth").poses
         odometry = PoseProvider(log).laser_poses(times, "odom").poses
         errors["odometry"] = (*pose_rmse(odometry, truth), math.nan)
@@ -150,7 +150,7 @@ def speed_table() -> str:
         path = Path(folder) / "long.mcap"
         record_session(path, SessionOptions(seed=0, motion="drive", duration=600.0, lidar=Lidar(rays=2)))
         with open_log(path) as log:
-            scans = ScanLog(log, None, Selection())
+            scans = ScanLog(log, Selection())
             whole = best_of(3, lambda: PoseProvider(log).laser_poses(scans.times, FUSED))
             fusion = PoseProvider(log).laser_poses(scans.times, FUSED).fusion
         assert fusion is not None
@@ -214,7 +214,7 @@ def matching_errors(seed: int) -> Errors:
     with tempfile.TemporaryDirectory() as folder:
         path = driven(folder, seed)
         with open_log(path) as log:
-            scans = ScanLog(log, None, Selection())
+            scans = ScanLog(log, Selection())
             truth = PoseProvider(log).laser_poses(scans.times, "truth").poses
             posed_scans = partial(PosedScans, scans)
             for source in ("odom", FUSED):
@@ -252,7 +252,7 @@ def csail_table(path: Path) -> str:
     """Compare the log-likelihood of held-out scans of csail.mcap (nats per ray) before and after matching."""
     lines = ["| poses of csail.mcap | held-out, nats per ray | matched | time |", "|---|---:|---:|---:|"]
     with open_log(path) as log:
-        scans = ScanLog(log, None, Selection())
+        scans = ScanLog(log, Selection())
         given = PoseProvider(log).laser_poses(scans.times)
         posed_scans = partial(PosedScans, scans, options=PosedScanOptions(CSAIL_RESOLUTION / 2))
         rng = np.random.default_rng(1)

@@ -16,9 +16,10 @@ from prim.shapes import Primitive
 from recorder.session import SessionOptions, record_session
 from replay.ground_truth import GroundTruth
 from replay.mapping_stage import grid_frame_of_world
-from replay.posed_scans import PosedScans, ScanLog
 from replay.poses.pose_provider import PoseProvider
-from replay.selection import Selection
+from replay.scans.posed_scans import PosedScans
+from replay.scans.scan_log import ScanLog
+from replay.scans.selection import Selection
 
 
 @dataclass(frozen=True)
@@ -72,6 +73,6 @@ def scans_with_poses(log: LogSource, source: str = "auto") -> list[tuple[Scan, P
     Returns:
         The scans, each as a whole, with the laser's pose at its first beam.
     """
-    scan_log = ScanLog(log, None, Selection())
+    scan_log = ScanLog(log, Selection())
     poses = PoseProvider(log, None, None).laser_poses(scan_log.times, source)
     return [(posed.scan, posed.pose) for posed in PosedScans(scan_log, poses)]

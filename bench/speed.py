@@ -34,12 +34,12 @@ from bench.sessions import recorded
 from mapping.mapper import make_mapper
 from prim.choices import MapperName
 from prim.log import open_log
+from prim.log.decoding.ros import decode_scan
 from prim.log.messages import (
     ODOM_TOPIC,
     ODOMETRY_TYPE,
     SCAN_TOPIC,
     SCAN_TYPE,
-    decode_scan,
     encode_odometry,
     encode_scan,
 )
@@ -193,7 +193,7 @@ def long_log(path: Path, scans: int, beams: int) -> None:
 
 def scans_of(log: Path) -> Iterator[Scan]:
     with open_log(log) as reader:
-        for _, scan in reader.decoded(reader.topics[SCAN_TOPIC], decode_scan):
+        for _, scan in reader.decoded(reader.topics[SCAN_TOPIC]):
             yield scan
 
 

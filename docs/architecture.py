@@ -45,7 +45,7 @@ SCAN = (
     ),
     Stage(
         "Select and decode scans",
-        (("replay/posed_scans.py", "ScanLog"), ("prim/log/messages.py", "decode_scan")),
+        (("replay/scans/scan_log.py", "ScanLog"), ("prim/log/decoding/ros.py", "decode_scan")),
         "Scan: every range classified",
     ),
     Stage(
@@ -55,7 +55,7 @@ SCAN = (
     ),
     Stage(
         "Pose each scan, cut long sweeps",
-        (("replay/posed_scans.py", "PosedScans"), ("prim/scan.py", "deskew")),
+        (("replay/scans/posed_scans.py", "PosedScans"), ("prim/scan.py", "deskew")),
         "PosedScan",
     ),
     Stage(

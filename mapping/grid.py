@@ -19,13 +19,22 @@ UNKNOWN = np.float32(0.5)
 class MapSizeError(UsageError):
     """A map that would have too many cells.
 
+    Args:
+        what: How large it would be.
+        resolution: The side of its cells (m).
+        excess: By how much too many there would be: their number over the largest.
+
     Attributes:
         what: How large it would be, without the hint.
+        coarser: A resolution (m) of which there would be few enough.
     """
 
-    def __init__(self, what: str) -> None:
+    def __init__(self, what: str, resolution: float, excess: float) -> None:
         self.what = what
-        super().__init__(f"{what}: give a coarser --resolution or smaller --bounds")
+        finest = resolution * math.sqrt(excess)
+        digit = 10.0 ** math.floor(math.log10(finest))
+        self.coarser = math.ceil(1.01 * finest / digit) * digit
+        super().__init__(f"{what}: give --resolution {self.coarser:g} or a coarser one, or smaller --bounds")
 
 
 UNKNOWN_GREY = 128
@@ -80,7 +89,9 @@ class GridFrame:
             metres = f"{self.cols * self.resolution:.0f} x {self.rows * self.resolution:.0f} m"
             raise MapSizeError(
                 f"a map of {metres} has {self.rows * self.cols / 1e6:.0f} million cells of {self.resolution:g} m, "
-                f"more than {MAX_CELLS / 1e6:.0f} million"
+                f"more than {MAX_CELLS / 1e6:.0f} million",
+                self.resolution,
+                self.rows * self.cols / MAX_CELLS,
             )
 
     @classmethod

@@ -23,6 +23,24 @@ class SensorModelName(StrEnum):
     GAUSSIAN = "gaussian"
 
 
+class ClockName(StrEnum):
+    """The clocks that messages may be stamped by: their headers', the log's, or the headers' moved onto one clock."""
+
+    AUTO = "auto"
+    HEADER = "header"
+    LOG = "log"
+
+
+class SweepName(StrEnum):
+    """What a scan's stamp may be the time of: its first beam or its last, of which the last may be measured first."""
+
+    AUTO = "auto"
+    START = "start"
+    END = "end"
+    START_REVERSED = "start-reversed"
+    END_REVERSED = "end-reversed"
+
+
 class PoseSourceName(StrEnum):
     """The sources of poses."""
 

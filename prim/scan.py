@@ -45,6 +45,18 @@ class RangeOutcome(IntEnum):
 MAX_TIME_INCREMENT = 1e3
 """A longer time from beam to beam (s) is none; set by hand."""
 
+MIN_STEP = 1e-6
+"""Beams that are closer to each other (rad) are not apart; set by hand."""
+
+TURN_TOLERANCE = 0.02
+"""Beams may reach over a turn by this share of it: some drivers count a beam more; set by hand."""
+
+MAX_FIELD = 2 * math.tau
+"""Beams that reach farther (rad) are not in radians: no sweep makes two turns; set by hand."""
+
+STEP_TOLERANCE = 0.02
+"""A number of steps this near to a whole one is one: angles are in single precision; set by hand."""
+
 _MEASURED, _TOO_NEAR, _NO_RETURN, _INVALID = (np.int8(outcome) for outcome in RangeOutcome)
 
 
@@ -65,6 +77,8 @@ class Scan:
         time_increment: From one beam to the next (s).
         scan_time: From one scan to the next (s).
         first_beam: Which beam of the sweep the first one is: not 0 in a part of a sweep.
+        angle_max: Bearing of the last beam as the log says it (rad); NaN where it does not. Beams are where
+            ``angle_increment`` puts them; :func:`reconciled_angles` compares both.
     """
 
     stamp: int
@@ -77,6 +91,7 @@ class Scan:
     time_increment: float = 0.0
     scan_time: float = 0.0
     first_beam: int = 0
+    angle_max: float = math.nan
 
     @property
     def problem(self) -> str | None:
@@ -86,6 +101,11 @@ class Scan:
         ):
             angles = f"angle_min {self.angle_min:g}, angle_increment {self.angle_increment:g}"
             return f"{angles}, range_min {self.range_min:g}"
+        if len(self.ranges) > 1 and self.angle_increment == 0:
+            return "angle_increment 0, and angle_min and angle_max do not tell more"
+        if max(abs(self.angle_min), abs(self.angle_increment) * (len(self.ranges) - 1)) > MAX_FIELD:
+            angles = f"angle_min {self.angle_min:g}, angle_increment {self.angle_increment:g}"
+            return f"{angles} for {len(self.ranges)} beams: these are no radians"
         if not self.range_max > max(self.range_min, 0.0):
             return f"range_max {self.range_max:g} is not above range_min {self.range_min:g} and 0"
         return None
@@ -158,12 +178,14 @@ class PosedScan:
         scan: The whole scan.
         pose: The laser's pose in the map frame at the first beam.
         pieces: The scan in parts, each with the laser's pose while it was taken (see :func:`deskew`).
+        scanner: Which of the scanners took it, from 0.
     """
 
     position: int
     scan: Scan
     pose: Pose2D
     pieces: Sequence[tuple[Scan, Pose2D]]
+    scanner: int = 0
 
     @property
     def points(self) -> FloatArray:
@@ -213,6 +235,65 @@ def deskew(
         at = Pose2D(pose.x + share * dx, pose.y + share * dy, wrap_angle(pose.theta + share * turn), pose.covariance)
         pieces.append((piece, at))
     return pieces
+
+
+def reconciled_angles(scan: Scan) -> tuple[Scan, str | None]:
+    """Return a scan whose beams end at its ``angle_max``, where its ``angle_increment`` contradicts that.
+
+    The increment remains where it can be right and the ends cannot: where they are more than a turn apart,
+    ``angle_max`` alone is 0 (it was not set), or the scan has fewer ranges than the angles are for, which leaves a
+    whole number of steps between the ends.
+
+    Args:
+        scan: The scan. An increment that ends within two beams, or one hundredth of the field of view, of angle_max
+            does not contradict it: many drivers count one beam more or less.
+
+    Returns:
+        The scan, itself where nothing contradicts, or its ends do not tell more; and what contradicts what and
+        which is used, None where nothing does.
+    """
+    steps = len(scan.ranges) - 1
+    field = scan.angle_max - scan.angle_min
+    if steps < 1 or not math.isfinite(field) or field == 0:
+        return scan, None
+    end = scan.angle_increment * steps
+    allowed = max(2 * abs(field) / steps, abs(field) / 100)
+    if abs(end - field) <= allowed or _ends_at_a_turn_from(end, field, allowed):
+        return scan, None
+    if _is_field(end, steps):
+        if not _is_field(field, steps):
+            return scan, _INCREMENT_REMAINS
+        if scan.angle_max == 0:
+            return scan, _INCREMENT_REMAINS
+        if _is_cut_short(field / scan.angle_increment, steps):
+            return scan, _CUT_SHORT
+    return replace(scan, angle_increment=field / steps), _ENDS_DECIDE
+
+
+_ENDS_DECIDE = "angle_increment contradicts angle_min and angle_max in {}: beams are spread evenly between these"
+_INCREMENT_REMAINS = "angle_max contradicts angle_min and angle_increment in {}: it is not used"
+_CUT_SHORT = (
+    "there are fewer ranges than angle_max and angle_increment say in {}: the last beams are taken to be missing"
+)
+
+
+def _is_field(field: float, steps: int) -> bool:
+    """Return whether beams can reach over an angle (rad): finite, more than nothing, and a turn at most."""
+    return MIN_STEP * steps < abs(field) <= math.tau * (1 + TURN_TOLERANCE)  # False for NaN
+
+
+def _ends_at_a_turn_from(end: float, field: float, allowed: float) -> bool:
+    """Return whether angle_max is where beams end, but for a turn (rad) by which it was wrapped."""
+    opposed = abs(field) <= allowed or (end < 0) != (field < 0)
+    return opposed and abs(end) <= math.tau + allowed and abs(abs(end - field) - math.tau) <= allowed
+
+
+def _is_cut_short(expected: float, steps: int) -> bool:
+    """Return whether more steps are ``expected`` by the ends: a whole number, and no multiple of those there are."""
+    whole = round(expected)
+    if whole <= steps or abs(expected - whole) > STEP_TOLERANCE:
+        return False
+    return all(whole % count for count in (steps - 1, steps, steps + 1) if count > 0)
 
 
 def mirror_scan(scan: Scan) -> Scan:

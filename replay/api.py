@@ -38,8 +38,8 @@ from replay.outputs.exports import log_stem, write_map, write_report, write_traj
 from replay.outputs.found_primitives import FoundPrimitive, found_primitives
 from replay.outputs.report import report_json
 from replay.pipeline import Pipeline
-from replay.posed_scans import ScanLog
 from replay.result import ReplayResult
+from replay.scans.scan_log import ScanLog
 from replay.timing import StageTimer
 from replay.viewing.protocol import Viewer, ViewerOptions
 
@@ -153,7 +153,7 @@ def replay(
     """Replay a log through a mapper and the detector.
 
     Args:
-        log: An MCAP log, or the folder of a ROS 2 bag.
+        log: A log of any format that :func:`prim.log.open_log` reads.
         save: Where rerun's recording is saved; None for no recording.
         force: Whether a file in its place may be replaced that is no earlier recording of prim.
         progress: Called after each scan with the number of scans so far and in all.
@@ -186,7 +186,7 @@ def replay_each(
     """Replay a log through several mappers side by side: ``mapper=["det", "prob", "forward"]``.
 
     Args:
-        log: An MCAP log, or the folder of a ROS 2 bag.
+        log: A log of any format that :func:`prim.log.open_log` reads.
         save: Where rerun's recording of all of them is saved; None for no recording.
         force: Whether a file in its place may be replaced that is no earlier recording of prim.
         progress: Called after each scan with the number of scans so far and in all.
@@ -212,7 +212,7 @@ def posed_scans(log: str | Path, **options: Unpack[ReplayKeywords]) -> Iterator[
     A scan during which the laser moves is cut into pieces with a pose each; ``deskew=False`` leaves all whole.
 
     Args:
-        log: An MCAP log, or the folder of a ROS 2 bag.
+        log: A log of any format that :func:`prim.log.open_log` reads.
         **options: As for :func:`replay`; those of the mapper and the detector have no effect.
 
     Returns:
@@ -235,9 +235,9 @@ def _posed_scans(path: Path, options: ReplayOptions) -> Iterator[tuple[Scan, Pos
         blames_log_for_size(path, options),
         prim.log.open_log(path, recover=options.recover) as source,
     ):
-        scans = ScanLog(source, options.scan_topic, options.selection)
-        poses = localize(source, scans, options, timer).poses
-        for posed in pose_scans(scans, poses, options, timer):
+        scans = ScanLog(source, options.selection, options.scan_log)
+        found = localize(scans, options, timer)
+        for posed in pose_scans(found.scans, found.poses, options, timer):
             yield from posed.pieces
 
 
@@ -245,7 +245,7 @@ def open_log(log: str | Path, recover: bool = False) -> LogSource:
     """Open a log: its topics, messages, metadata and attachments, as :class:`prim.log.source.LogSource` has them.
 
     Args:
-        log: An MCAP log, or the folder of a ROS 2 bag.
+        log: A log of any format that :func:`prim.log.open_log` reads.
         recover: Read what is left of a damaged log.
 
     Returns:

@@ -12,8 +12,8 @@ from replay.detection.stage import DetectionResult, DetectionStage, make_detecti
 from replay.intervals import NEVER, snapshot_interval
 from replay.mapping_stage import MappingStage, Usage, make_replay_mapper
 from replay.options import ReplayOptions
-from replay.posed_scans import PosedScans
 from replay.replay_evaluator import ReplayEvaluator
+from replay.scans.posed_scans import PosedScans
 from replay.timing import StageTimer
 from replay.viewing.protocol import Viewer
 

@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import typer
 
 from prim import __version__, console
-from prim.choices import MapperName, PoseSourceName, SensorModelName
+from prim.choices import ClockName, MapperName, PoseSourceName, SensorModelName, SweepName
 from prim.errors import InterruptedRunError, PrimError, UsageError
 from prim.interrupts import interrupted_run
 
@@ -47,7 +47,10 @@ def _show_version(wanted: bool) -> None:
 @app.command()
 def replay(
     context: typer.Context,
-    logs: Annotated[list[Path], typer.Argument(metavar="LOG...", help="MCAP logs, or folders of ROS 2 bags.")],
+    logs: Annotated[
+        list[Path],
+        typer.Argument(metavar="LOG...", help="MCAP logs, ROS 1 or ROS 2 bags, CARMEN logs."),
+    ],
     mapper: Annotated[
         str,
         typer.Option(
@@ -58,7 +61,21 @@ def replay(
     pose: Annotated[PoseSourceName, typer.Option(help="The source of poses.")] = PoseSourceName.AUTO,
     resolution: Annotated[float, typer.Option(metavar="M", help="Side of a cell, metres.")] = 0.01,
     bounds: Annotated[str, typer.Option(metavar="auto or X0 Y0 X1 Y1", help="The map's bounds, metres.")] = "auto",
-    scan_topic: Annotated[str | None, typer.Option(metavar="T", help="The topic of scans.")] = None,
+    scan_topic: Annotated[
+        list[str] | None,
+        typer.Option(metavar="T", help="The topic of scans; give it again for scanners that are mapped together."),
+    ] = None,
+    height_slice: Annotated[
+        tuple[float, float] | None,
+        typer.Option("--slice", metavar="ZMIN ZMAX", help="Make scans of a 3D lidar's points at these heights."),
+    ] = None,
+    clock: Annotated[
+        ClockName,
+        typer.Option(
+            help="What messages are stamped by: their headers, or when they were logged. auto: the headers, moved "
+            "onto one clock where they are not."
+        ),
+    ] = ClockName.AUTO,
     odom_topic: Annotated[str | None, typer.Option(metavar="T", help="The topic of odometry or poses.")] = None,
     fuse: Annotated[
         str | None,
@@ -87,6 +104,13 @@ def replay(
     no_deskew: Annotated[
         bool, typer.Option("--no-deskew", help="Treat all beams of a scan as measured at its stamp.")
     ] = False,
+    sweep: Annotated[
+        SweepName,
+        typer.Option(
+            help="Whose time a scan's stamp is: the first beam's, or the last one's; reversed: beams run against "
+            "time. auto: as the log says, unless scans clearly fit each other better otherwise."
+        ),
+    ] = SweepName.AUTO,
     start: Annotated[float | None, typer.Option(metavar="S", help="Begin S seconds into the log.")] = None,
     end: Annotated[float | None, typer.Option(metavar="S", help="End S seconds into the log.")] = None,
     duration: Annotated[float | None, typer.Option(metavar="S", help="Replay S seconds.")] = None,
@@ -174,6 +198,11 @@ def replay(
         bool, typer.Option("--force", help="Replace files that are no earlier results of prim-replay.")
     ] = False,
     recover: Annotated[bool, typer.Option("--recover", help="Read what is intact of a damaged log.")] = False,
+    list_topics: Annotated[
+        bool,
+        typer.Option("--list", help="Show what logs hold, and what would be used of it; replay nothing."),
+    ] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="With --list: as JSON, an object for each log.")] = False,
     quiet: Annotated[bool, typer.Option("--quiet", help="Print errors only, and the addresses of --serve.")] = False,
     verbose: Annotated[
         bool, typer.Option("--verbose", help="Report stage timings, and rejected candidates with the reasons.")
@@ -183,7 +212,7 @@ def replay(
         bool, typer.Option("--version", callback=_show_version, is_eager=True, help="Print the version.")
     ] = False,
 ) -> int:
-    """Replay MCAP logs of a 2D LiDAR through an occupancy mapper and show the result in rerun.
+    """Replay logs of a 2D LiDAR through an occupancy mapper and show the result in rerun.
 
     Each log leaves a recording and a report in this folder: LOG.MAPPER.rrd and LOG.MAPPER.report.json. Several
     mappers share a recording, and each has a report.
@@ -201,7 +230,9 @@ def replay(
         pose=pose.value,
         resolution=resolution,
         bounds=_parse_bounds(bounds),
-        scan_topic=scan_topic,
+        scan_topic=scan_topic or None,
+        height_slice=height_slice,
+        clock=clock.value,
         odom_topic=odom_topic,
         laser_offset=_in_radians(laser_offset),
         max_range=max_range,
@@ -212,6 +243,7 @@ def replay(
         pose_noise=_in_radians(pose_noise),
         odom_noise=_in_radians(odom_noise),
         deskew=not no_deskew,
+        sweep=sweep.value,
         match_scans=match_scans,
         start=start,
         end=end,
@@ -227,6 +259,12 @@ def replay(
         recover=recover,
     )
     files = OutputFiles(save, report, map_output, trajectory, force)
+    if as_json and not list_topics:
+        raise UsageError("--json goes with --list")
+    if list_topics:
+        if files != OutputFiles(None, None, None, None, force) or viewer.watched:
+            raise UsageError("--list replays nothing: it excludes --save, --report, --map, --trajectory and viewers")
+        return _list_logs(logs, options, as_json, debug)
     run = Run(options, None if no_viewer else viewer, context.obj, Verbosity(quiet, verbose, debug))
     return _replay_logs(logs, files, run)
 
@@ -369,6 +407,36 @@ def _with_name_of(mapper: str, path: Path) -> Path:
     return path.with_name(f"{path.name.removesuffix(suffix)}.{mapper}{suffix}")
 
 
+def _list_logs(logs: Sequence[Path], options: ReplayOptions, as_json: bool, debug: bool) -> int:
+    """Print what logs hold, and what a replay would use of it; return the exit code of the worst."""
+    from prim import strict_json
+    from replay.listing import summarize_log, summary_rows, topic_table
+
+    codes = []
+    for log in logs:
+        try:
+            summary = summarize_log(log, options)
+        except PrimError as error:
+            if len(logs) == 1:
+                raise
+            codes.append(console.print_error("prim-replay", error, debug))
+            continue
+        codes.append(PARTLY_LOST if summary.lost else 0)
+        if as_json:
+            console.echo(strict_json.dumps(summary.to_json()))
+            continue
+        console.print_table(summary_rows(summary))
+        head, *rows = topic_table(summary)
+        console.print_table(rows, head)
+        for note in (*summary.notes, *(f"lost: {lost}" for lost in summary.lost)):
+            console.echo(f"note: {note}")
+    return _worst(codes)
+
+
+def _worst(codes: Sequence[int]) -> int:
+    return next((code for code in (console.FAILED, console.USAGE, PARTLY_LOST) if code in codes), 0)
+
+
 def _replay_logs(logs: Sequence[Path], files: OutputFiles, run: Run) -> int:
     """Replay logs one after the other; return the exit code of the worst."""
     from prim.files import check_distinct, check_no_input
@@ -391,7 +459,7 @@ def _replay_logs(logs: Sequence[Path], files: OutputFiles, run: Run) -> int:
             if len(jobs) == 1:
                 raise
             codes.append(console.print_error("prim-replay", error, run.verbosity.debug))
-    return next((code for code in (console.FAILED, console.USAGE, PARTLY_LOST) if code in codes), 0)
+    return _worst(codes)
 
 
 def _replay_log(log: Path, outputs: OutputFiles, run: Run) -> int:

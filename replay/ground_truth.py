@@ -7,7 +7,8 @@ from dataclasses import replace
 
 from prim import strict_json
 from prim.errors import WorldError
-from prim.log.messages import MARKERS_TYPE, TRUE_PRIMITIVES_TOPIC, decode_primitives
+from prim.log.decoding.codecs import Content
+from prim.log.messages import TRUE_PRIMITIVES_TOPIC
 from prim.log.source import LogSource
 from prim.world import World
 
@@ -41,11 +42,11 @@ class GroundTruth:
         except ValueError as error:
             raise WorldError(f"its world.json does not describe a world: {error}") from error
         topic = log.topics.get(TRUE_PRIMITIVES_TOPIC)
-        if topic is None or topic.type != MARKERS_TYPE or not topic.messages:
+        if topic is None or topic.content is not Content.PRIMITIVES or not topic.messages:
             return cls(world, [])
         changes = [
             (stamp or log_time, replace(world, primitives=primitives))
-            for log_time, (stamp, primitives) in log.decoded(topic, decode_primitives)
+            for log_time, (stamp, primitives) in log.decoded(topic)
         ]
         return cls(world, sorted(changes, key=lambda item: item[0]))
 

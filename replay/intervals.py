@@ -55,7 +55,8 @@ def snapshot_interval(options: ReplayOptions, scans: int, cells: int) -> Interva
     if times >= min(MAP_SNAPSHOTS, scans):
         return _spread(times, scans)
     often = f"the map is large and shown {pluralize(times, 'time')} along the way"
-    return _spread(times, scans, f"{often}: more often with --map-every, or with a coarser --resolution")
+    more = _spread(min(2 * times, scans), scans).scans
+    return _spread(times, scans, f"{often}: more often with --map-every {more}, or with a coarser --resolution")
 
 
 def detection_interval(options: ReplayOptions, scans: int, cells: int, is_shown: bool) -> Interval:
@@ -83,8 +84,9 @@ def detection_interval(options: ReplayOptions, scans: int, cells: int, is_shown:
     if times >= min(most, scans):
         return _spread(times, scans)
     often = f"{pluralize(times, 'time')} along the way" if times else "at the end only"
+    more = _spread(min(2 * max(times, 1), scans), scans).scans
     return _spread(
-        times, scans, f"the map is large, and primitives are detected {often}: more often with --detect-every N"
+        times, scans, f"the map is large, and primitives are detected {often}: more often with --detect-every {more}"
     )
 
 

@@ -11,14 +11,14 @@ from prim.se2 import Pose2D
 from prim.world import Bounds
 from replay.options import ReplayOptions
 from replay.poses.fusion_options import SENSORS, FusionInputs, SensorNoise
-from replay.selection import Selection
+from replay.scans.selection import Selection
 
 
 class ReplayKeywords(TypedDict, total=False):
     """What may be given of a replay; what is not given, or None, is as on the command line.
 
     Lengths are metres, angles radians, times seconds. :class:`replay.options.ReplayOptions` and
-    :class:`replay.selection.Selection` say what each means; the rest is described here.
+    :class:`replay.scans.selection.Selection` say what each means; the rest is described here.
     """
 
     mapper: str | Sequence[str]
@@ -28,7 +28,10 @@ class ReplayKeywords(TypedDict, total=False):
     pose: str
     resolution: float
     bounds: Bounds | None
-    scan_topic: str | None
+    scan_topic: str | Sequence[str] | None
+    """The topic of scans, or several: a list, or separated by commas."""
+    clock: str
+    height_slice: tuple[float, float] | None
     odom_topic: str | None
     laser_offset: tuple[float, float, float] | Pose2D | None
     """The laser's pose on the robot: x, y (m), heading (rad)."""
@@ -44,6 +47,7 @@ class ReplayKeywords(TypedDict, total=False):
     """Standard deviations of the odometry's position (m) and heading (rad) after one metre."""
     match_scans: bool
     deskew: bool
+    sweep: str
     start: float | None
     end: float | None
     duration: float | None
@@ -85,6 +89,8 @@ def replay_options(**keywords: Unpack[ReplayKeywords]) -> ReplayOptions:
     fuse = _fusion_inputs(**{name: given.pop(name) for name in _FUSION if name in given})  # type: ignore[arg-type]
     if "mapper" in given:
         given["mapper"] = ",".join(_listed(given["mapper"]))  # type: ignore[arg-type]
+    if "scan_topic" in given:
+        given["scan_topic"] = _listed(given["scan_topic"])  # type: ignore[arg-type]
     if "laser_offset" in given:
         given["laser_offset"] = _as_pose(given["laser_offset"])  # type: ignore[arg-type]
     if "weights" in given:

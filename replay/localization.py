@@ -2,39 +2,59 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import replace
 from functools import partial
 from typing import NamedTuple
 
+import numpy as np
+from numpy.typing import NDArray
+
+from prim.arrays import Stamps
+from prim.choices import SweepName
 from prim.errors import LogReadError
-from prim.log.source import LogSource
+from prim.scan import PosedScan
 from replay.options import ReplayOptions
-from replay.posed_scans import PosedScanOptions, PosedScans, ScanLog
 from replay.poses.fusion_options import FusionInputs, SensorNoise
-from replay.poses.laser_poses import FUSED, LaserPoses
+from replay.poses.laser_poses import AT_ONCE, BEAM_TIMES, FUSED, BeamTimes, LaserPoses, ScanTimes, stated_beam_times
 from replay.poses.pose_provider import PoseProvider
+from replay.scans.posed_scans import PosedScanOptions, PosedScans
+from replay.scans.scan_log import ScanLog
 from replay.timing import StageTimer
+
+_MEANINGS = {
+    BEAM_TIMES[SweepName.START]: ("beams are measured from the stamp on", "--sweep start"),
+    BEAM_TIMES[SweepName.END]: ("the stamp is the last beam's", "--sweep end"),
+    BEAM_TIMES[SweepName.START_REVERSED]: ("the last beam is measured first, at the stamp", "--sweep start-reversed"),
+    BEAM_TIMES[SweepName.END_REVERSED]: (
+        "the last beam is measured first, and the stamp is the first beam's",
+        "--sweep end-reversed",
+    ),
+    AT_ONCE: ("all beams of a scan are measured at its stamp", "--no-deskew"),
+}
+"""What times of beams mean, and the option that sets them."""
 
 
 class Localization(NamedTuple):
     """The poses of the laser at the scans of a log.
 
     Attributes:
+        scans: The scans, with the times at which their beams were measured.
         poses: The poses that the replay uses.
         true_poses: The true ones; None where the log has none, or none that can be used.
         notes: What a user should know of how they were chosen.
     """
 
+    scans: ScanLog
     poses: LaserPoses
     true_poses: LaserPoses | None
     notes: tuple[str, ...]
 
 
-def localize(log: LogSource, scans: ScanLog, options: ReplayOptions, timer: StageTimer) -> Localization:
+def localize(scans: ScanLog, options: ReplayOptions, timer: StageTimer) -> Localization:
     """Find the poses of the laser by the source that is asked for, matched where that is asked for.
 
     Args:
-        log: The log.
         scans: The scans that are replayed.
         options: Options of the replay.
         timer: Counts the time of reading scans that are matched towards the stage «read».
@@ -46,11 +66,20 @@ def localize(log: LogSource, scans: ScanLog, options: ReplayOptions, timer: Stag
         LogReadError: The log has no such poses.
         UsageError: The options do not fit the log.
     """
-    found = _look_up_poses(log, scans, options)
+    provider = PoseProvider(scans.log, options.odom_topic, options.laser_offset, options.fuse)
+    found = _look_up_poses(provider, _retimed(scans, options), options)
+    if options.sweep == SweepName.AUTO:
+        found = _with_beam_times_that_fit(provider, found, options, timer)
+    elif not scans.sweep:
+        note = f"--sweep {options.sweep} changes nothing: scans have no time_increment that is plausible"
+        found = found._replace(notes=(*found.notes, note))
+    if found.poses.mount_assumed and len(scans.scanners) == 1:
+        found = found._replace(poses=_with_suggested_mount(found.poses, found.scans, options, timer))
     if not options.match_scans:
         return found
     from replay.poses.scan_matching import match_scans  # when it is needed: a replay without it starts faster
 
+    scans = found.scans
     posed = partial(pose_scans, scans, options=options, timer=timer)
     poses = match_scans(
         found.poses, scans.stamps, posed, options.resolution, options.noise_std, options.fuse.noise, options.bounds
@@ -73,23 +102,74 @@ def pose_scans(scans: ScanLog, poses: LaserPoses, options: ReplayOptions, timer:
     return PosedScans(scans, poses, PosedScanOptions(options.resolution / 2, options.max_range), timer)
 
 
-def _look_up_poses(log: LogSource, scans: ScanLog, options: ReplayOptions) -> Localization:
+def _retimed(scans: ScanLog, options: ReplayOptions) -> ScanLog:
+    """Return scans whose beams were measured when the options say so."""
+    return scans if options.sweep == SweepName.AUTO else scans.retimed(BEAM_TIMES[options.sweep])
+
+
+def _with_suggested_mount(poses: LaserPoses, scans: ScanLog, options: ReplayOptions, timer: StageTimer) -> LaserPoses:
+    """Add a note where the scans agree better with the laser elsewhere on the robot than at its origin."""
+    from replay.poses.mount_estimation import estimate_mount  # when it is needed: a replay without it starts faster
+
+    posed = partial(pose_scans, scans, options=options, timer=timer)
+    estimate = estimate_mount(poses, scans.stamps, posed)
+    if estimate is None or not estimate.is_significant():
+        return poses
+    return replace(poses, notes=(*poses.notes, estimate.note()))
+
+
+def _look_up_poses(provider: PoseProvider, scans: ScanLog, options: ReplayOptions) -> Localization:
     """Return the laser's poses by the source that is asked for, and the true ones where the log has them."""
-    provider = PoseProvider(log, options.odom_topic, options.laser_offset, options.fuse)
-    times = scans.times if options.deskew else replace(scans.times, sweep=0)
+    times = scans.times if options.deskew else scans.times.at_once()
     if options.standing_still:
-        return Localization(provider.stationary_poses(times), None, ())
+        return Localization(scans, provider.stationary_poses(times), None, ())
     poses = provider.laser_poses(times, options.pose)
     fuse = replace(options.fuse, noise=SensorNoise()) if options.match_scans else options.fuse
     notes = []
     if fuse != FusionInputs() and poses.source != FUSED:
         notes.append(f"nothing is fused, since there are poses on {poses.origin}: give --pose fused")
     if poses.source == "truth":
-        return Localization(poses, poses, tuple(notes))
+        return Localization(scans, poses, poses, tuple(notes))
     true_poses = None
     if provider.has_truth:
         try:
             true_poses = provider.laser_poses(times, "truth")
         except LogReadError as error:
             notes.append(f"the poses are not held against the truth: {error.what}")
-    return Localization(poses, true_poses, tuple(notes))
+    return Localization(scans, poses, true_poses, tuple(notes))
+
+
+def _with_beam_times_that_fit(
+    provider: PoseProvider, found: Localization, options: ReplayOptions, timer: StageTimer
+) -> Localization:
+    """Return the poses at other times of the beams, where scans clearly fit each other better by these."""
+    scans, poses = found.scans, found.poses
+    if not scans.sweep or poses.end_poses is None or options.standing_still or len(scans.scanners) > 1:
+        return found
+    from replay.poses.sweep import find_beam_times  # when it is needed: a replay without it starts faster
+
+    def read(positions: NDArray[np.intp]) -> Iterable[PosedScan]:
+        return pose_scans(scans.only(positions), poses, options, timer)
+
+    def poses_at(stamps: Stamps) -> LaserPoses:
+        return provider.laser_poses(ScanTimes(stamps, (scans.first.frame_id,)), poses.source)
+
+    measured = scans.first.ranges[scans.first.measured]
+    reach = float(np.median(measured)) if len(measured) else 0.0
+    finding = find_beam_times(scans.times, poses, reach, options.resolution / 2, read, poses_at)
+    if finding is None:
+        return found
+    at_once = finding.times == AT_ONCE
+    retimed = scans if at_once else scans.retimed(finding.times)
+    other = _look_up_poses(provider, retimed, replace(options, deskew=not at_once))
+    note = _finding_note(finding.times, stated_beam_times(scans.sweep), finding.gain, finding.deviations)
+    return other._replace(notes=(*other.notes, note))
+
+
+def _finding_note(times: BeamTimes, stated: BeamTimes, gain: float, deviations: float) -> str:
+    """Describe times of beams that were found, and which options set them and those that the log says."""
+    meaning, option = _MEANINGS[times]
+    return (
+        f"scans fit each other best where {meaning}: a beam's log-likelihood is {gain:.2g} nats above that by the "
+        f"log's times ({deviations:.0f} standard errors); {option} sets this, {_MEANINGS[stated][1]} the log's times"
+    )

@@ -20,7 +20,8 @@ from prim.scan import PosedScan, Scan
 from prim.se2 import Pose2D
 from prim.world import World
 from replay.options import ReplayOptions
-from replay.posed_scans import PosedScans
+from replay.poses.sensors import REST_HINT
+from replay.scans.posed_scans import PosedScans
 from replay.timing import StageTimer
 
 WORLD_MARGIN = 0.1
@@ -121,7 +122,7 @@ class MappingStage:
             return [
                 f"{self.usage.far} of {self.usage.hits} rays that returned from a surface are longer than "
                 f"{self.usage.longest:.0f} m ({MAX_STEPS:.0f} cells): where they end is not on the map; "
-                "give a coarser --resolution if that is right, else --max-range"
+                f"give --max-range {self.usage.longest:.0f}, or if that is right a coarser --resolution"
             ]
         if not (grid.free | grid.occupied).any():
             return ["no ray crosses the map's bounds: all of it is unknown"]
@@ -144,7 +145,10 @@ def blames_log_for_size(path: Path, options: ReplayOptions) -> Iterator[None]:
     except MapSizeError as error:
         if options.bounds is not None or options.resolution < ReplayOptions.resolution:
             raise
-        hint = "give a coarser --resolution, the --bounds, or a --max-range where single ranges are too long"
+        hint = (
+            f"give --resolution {error.coarser:g} or a coarser one; where single ranges are too long, a --max-range, "
+            "or the --bounds"
+        )
         raise LogReadError(path, f"by its world, poses and ranges, {error.what}", hint) from error
 
 
@@ -170,7 +174,7 @@ def choose_grid_frame(posed_scans: PosedScans, options: ReplayOptions, world: Wo
     frame = grid_frame_of_scans((piece for posed in posed_scans for piece in posed.pieces), options.resolution)
     if frame is None:
         path = posed_scans.scan_log.path
-        raise LogReadError(path, "no scan that can be used has a pose", "give another --pose")
+        raise LogReadError(path, "no scan that can be used has a pose", REST_HINT)
     return frame
 
 
@@ -232,5 +236,5 @@ def make_replay_mapper(
             noise_std = estimate_range_noise(pieces, frame)
         if noise_std is None:
             what = "too few ranges to find the noise for the Gaussian sensor model"
-            raise LogReadError(posed_scans.scan_log.path, what, "give it: --noise-std")
+            raise LogReadError(posed_scans.scan_log.path, what, "give it, such as --noise-std 0.05")
     return make_mapper(options.mapper, options.resolution, frame.bounds, options.sensor_model, noise_std)

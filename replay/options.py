@@ -10,13 +10,14 @@ from typing import Final, Literal
 import numpy as np
 
 from mapping.mapper import check_cells, check_mapper, takes_noise
-from prim.choices import MapperName, PoseSourceName, SensorModelName
+from prim.choices import ClockName, MapperName, PoseSourceName, SensorModelName, SweepName
 from prim.errors import UsageError
 from prim.se2 import Pose2D
 from prim.world import Bounds
 from replay.poses.fusion_options import FusionInputs, SensorNoise
 from replay.poses.laser_poses import FUSED
-from replay.selection import Selection
+from replay.scans.scan_log import ScanLogOptions
+from replay.scans.selection import Selection
 
 END: Final = "end"
 """The value of ``detect_every`` for one detection, after the last scan."""
@@ -45,13 +46,19 @@ class ReplayOptions:
         pose: The source of poses (:class:`prim.choices.PoseSourceName`).
         resolution: Side of a cell (m).
         bounds: Bounds of the map (m): x0, y0, x1, y1; None to choose them.
-        scan_topic: The topic of scans; None where the log has only one.
+        scan_topic: The topics of scans that are mapped together; none: those of all scanners of one robot.
+        clock: The clock that messages are stamped by (:class:`prim.choices.ClockName`).
+        height_slice: The lowest and the highest z (m, in the sensor's frame) of a cloud's points that make a scan;
+            None: all points of a planar scanner.
         odom_topic: The topic of poses; None: found by type. Where one is given, the source ``auto`` means ``odom``.
         laser_offset: The laser's pose on the robot (m, rad); None where tf has it.
         max_range: Ranges beyond this count as no return (m); None for the scanner's own range_max.
         standing_still: The robot does not move: map without poses.
         fuse: What poses are fused from.
         deskew: Whether the laser's motion during a scan is compensated for.
+        sweep: When the beams of a scan are measured (:class:`prim.choices.SweepName`). «start»: from the stamp on;
+            «end»: until the stamp; «start-reversed» and «end-reversed»: the last beam first. «auto»: as the log says,
+            unless scans clearly fit each other better otherwise.
         match_scans: Whether poses are corrected by matching scans.
         selection: Which scans are replayed.
         rate: The replay is held to this multiple of the log's speed; None for no limit.
@@ -74,13 +81,16 @@ class ReplayOptions:
     pose: str = "auto"
     resolution: float = 0.01
     bounds: Bounds | None = None
-    scan_topic: str | None = None
+    scan_topic: tuple[str, ...] = ()
+    clock: str = ClockName.AUTO.value
+    height_slice: tuple[float, float] | None = None
     odom_topic: str | None = None
     laser_offset: Pose2D | None = None
     max_range: float | None = None
     standing_still: bool = False
     fuse: FusionInputs = field(default_factory=FusionInputs)
     deskew: bool = True
+    sweep: str = SweepName.AUTO.value
     match_scans: bool = False
     selection: Selection = field(default_factory=Selection)
     rate: float | None = None
@@ -105,8 +115,22 @@ class ReplayOptions:
             raise UsageError(f"--detect-every is {every}: it must be a number of scans, at least 1, or «{END}»")
         if not self.detect and (self.detect_every or self.weights or not self.refine):
             raise UsageError("--no-detect excludes --detect-every, --weights and --no-refine")
+        if self.clock not in [*ClockName]:
+            raise UsageError(f"--clock is {self.clock!r}: choose from {', '.join(ClockName)}")
+        lowest, highest = self.height_slice or (0.0, 1.0)
+        if not -math.inf < lowest < highest < math.inf:
+            raise UsageError(f"--slice is {lowest:g} {highest:g}: give two heights, the lower first")
+        if self.sweep not in [*SweepName]:
+            raise UsageError(f"--sweep is {self.sweep!r}: choose from {', '.join(SweepName)}")
+        if not self.deskew and self.sweep != SweepName.AUTO:
+            raise UsageError("--no-deskew excludes --sweep")
         self._check_poses()
         self._check_noise()
+
+    @property
+    def scan_log(self) -> ScanLogOptions:
+        """How scans are read."""
+        return ScanLogOptions(self.scan_topic, self.clock, self.height_slice)
 
     @property
     def mappers(self) -> tuple[str, ...]:

@@ -17,9 +17,10 @@ from replay.ground_truth import GroundTruth
 from replay.localization import Localization, localize, pose_scans
 from replay.mapping_stage import blames_log_for_size, choose_grid_frame
 from replay.options import ReplayOptions
-from replay.posed_scans import PosedScans, ScanLog
 from replay.replay_evaluator import ReplayEvaluator
 from replay.result import ReplayResult, distinct_notes
+from replay.scans.posed_scans import PosedScans
+from replay.scans.scan_log import ScanLog
 from replay.timing import RatePacer, StageTimer
 from replay.viewing.protocol import NullViewer, Scene, Viewer
 
@@ -88,8 +89,8 @@ class Pipeline:
             open_log(self.path, recover=self.options.recover) as log,
         ):
             scans = self._read_scans(log)
-            truth = self._read_truth(log)
-            poses, true_poses, _ = self._localize(log, scans)
+            truth = self._read_truth(scans.log)
+            scans, poses, true_poses, _ = self._localize(scans)
             posed_scans = pose_scans(scans, poses, self.options, self._timer)
             frame = choose_grid_frame(posed_scans, self.options, truth.world if truth else None)
             evaluator = ReplayEvaluator(frame, truth, poses, true_poses)
@@ -104,7 +105,7 @@ class Pipeline:
     def _read_scans(self, log: LogSource) -> ScanLog:
         """Find the scans that are to be replayed."""
         with self._timer.stage("read"):
-            return ScanLog(log, self.options.scan_topic, self.options.selection)
+            return ScanLog(log, self.options.selection, self.options.scan_log)
 
     def _read_truth(self, log: LogSource) -> GroundTruth | None:
         """Read the log's true world; note where it has one that is not valid."""
@@ -115,10 +116,10 @@ class Pipeline:
                 self._notes.append(f"the map is not scored: {error}")
                 return None
 
-    def _localize(self, log: LogSource, scans: ScanLog) -> Localization:
+    def _localize(self, scans: ScanLog) -> Localization:
         """Find the poses of the laser, matched where that is asked for, and the true ones."""
         with self._timer.stage("localize"):
-            localization = localize(log, scans, self.options, self._timer)
+            localization = localize(scans, self.options, self._timer)
         self._notes += localization.notes
         return localization
 
@@ -181,7 +182,7 @@ class Pipeline:
         first = int(scans.stamps[0])
         with self._timer.stage("viewer"):
             self.viewer.begin(scene)
-            self.viewer.event(0, first, f"{len(scans)} of {scans.total} scans selected on {scans.topic.name}")
+            self.viewer.event(0, first, f"{len(scans)} of {scans.total} scans selected on {scans.names}")
             self.viewer.event(0, first, f"poses: {poses.source} ({poses.origin})")
 
     def _show_scan(self, posed: PosedScan, evaluator: ReplayEvaluator) -> None:
@@ -216,6 +217,7 @@ class Pipeline:
         return tuple(
             ReplayResult(
                 path=self.path,
+                format=log.format,
                 options=branch.options,
                 duration=scans.duration(done),
                 scans=scans.total,
@@ -227,6 +229,7 @@ class Pipeline:
                 messages_lost=log.messages_lost,
                 poses=posed_scans.poses,
                 stamps=scans.stamps,
+                scanner=scans.scanner,
                 pose_rmse=evaluator.pose_rmse(),
                 pose_nees=evaluator.pose_nees(),
                 grid=outcome.grid,

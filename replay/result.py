@@ -22,6 +22,7 @@ class ReplayResult:
 
     Attributes:
         path: The log's path.
+        format: The log's format, for people.
         options: The options of the replay, with this mapper alone.
         duration: The time from the earliest selected scan to the latest (s).
         scans: The number of scans on the topic.
@@ -33,6 +34,7 @@ class ReplayResult:
         messages_lost: The number of messages that could not be read; None where it is not known.
         poses: The laser's poses at the selected scans.
         stamps: Stamps (N,) of the selected scans (ns).
+        scanner: By which scanner each of them (N,) was taken.
         pose_rmse: Root mean square position (m) and heading (rad) errors; None where poses are not compared.
         pose_nees: Mean normalized estimation error squared of the poses; None without covariances or truth.
         grid: The map.
@@ -45,6 +47,7 @@ class ReplayResult:
     """
 
     path: Path
+    format: str
     options: ReplayOptions
     duration: float
     scans: int
@@ -56,6 +59,7 @@ class ReplayResult:
     messages_lost: int | None
     poses: LaserPoses
     stamps: NDArray[np.int64]
+    scanner: NDArray[np.intp]
     pose_rmse: tuple[float, float] | None
     pose_nees: float | None
     grid: OccupancyGrid

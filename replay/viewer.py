@@ -178,8 +178,10 @@ class RerunViewer:
 
     def show_scan(self, posed: PosedScan) -> None:
         """See :meth:`.Viewer.show_scan`."""
-        self._trajectory.append((posed.pose.x, posed.pose.y))
-        if self._batch.add(ScanEntry(posed.position, posed.scan.stamp, posed.pose, posed.points)):
+        if posed.scanner == 0:
+            self._trajectory.append((posed.pose.x, posed.pose.y))
+        entry = ScanEntry(posed.position, posed.scan.stamp, posed.pose, posed.points, posed.scanner)
+        if self._batch.add(entry):
             self._send_batch()
 
     def show_mapping_time(self, mapper: str, posed: PosedScan, seconds: float) -> None:
@@ -363,9 +365,12 @@ class RerunViewer:
         """Send the gathered scans, pose errors and times as columns: one call for all instead of one for each."""
         entries = self._batch.take()
         if entries:
-            index = _time_columns([(entry.position, entry.stamp) for entry in entries])
-            self._send_scans(index, entries)
-            self._send_lasers(index, entries)
+            for scanner in sorted({entry.scanner for entry in entries}):
+                of_scanner = [entry for entry in entries if entry.scanner == scanner]
+                index = _time_columns([(entry.position, entry.stamp) for entry in of_scanner])
+                suffix = f"_{scanner + 1}" if scanner else ""
+                self._send_scans(index, of_scanner, f"{SCENE}/scan{suffix}")
+                self._send_lasers(index, of_scanner, f"{SCENE}/laser{suffix}")
             self._send_ellipses(entries)
             self._send_trajectory(entries[-1])
         errors, self._pose_errors = self._pose_errors, []
@@ -380,14 +385,12 @@ class RerunViewer:
             index = _time_columns(list(zip(positions, stamps, strict=True)))
             self._send_columns(f"{self._layers[mapper]}timing", index, rr.Scalars.columns(scalars=milliseconds))
 
-    def _send_scans(self, index: Sequence[Any], entries: list[ScanEntry]) -> None:
-        """Send the end points of scans."""
+    def _send_scans(self, index: Sequence[Any], entries: list[ScanEntry], path: str) -> None:
+        """Send the end points of scans of one scanner."""
         counts = [len(entry.points) for entry in entries]
         points = self._raised(np.concatenate([entry.points for entry in entries]), SCAN_HEIGHT)
-        self._send_columns(f"{SCENE}/scan", index, rr.Points3D.columns(positions=points).partition(counts))
-        self._set_style(
-            f"{SCENE}/scan", rr.Points3D.from_fields(colors=[SCAN_COLOR], radii=rr.Radius.ui_points(1.75))
-        )
+        self._send_columns(path, index, rr.Points3D.columns(positions=points).partition(counts))
+        self._set_style(path, rr.Points3D.from_fields(colors=[SCAN_COLOR], radii=rr.Radius.ui_points(1.75)))
 
     def _send_trajectory(self, last: ScanEntry) -> None:
         """Send the trajectory so far, as dots: a robot that is warped has no line to show."""
@@ -396,16 +399,14 @@ class RerunViewer:
         dots = rr.Points3D(points, colors=[TRAJECTORY_COLOR], radii=rr.Radius.ui_points(1.75))
         self._recording.log(f"{SCENE}/trajectory", dots)
 
-    def _send_lasers(self, index: Sequence[Any], entries: list[ScanEntry]) -> None:
-        """Send the laser's poses as arrows."""
+    def _send_lasers(self, index: Sequence[Any], entries: list[ScanEntry], path: str) -> None:
+        """Send the poses of one laser as arrows."""
         poses = [entry.pose for entry in entries]
         length = LASER_LENGTH * min(self._size, MAX_SCALE)
         origins = self._raised(np.array([(pose.x, pose.y) for pose in poses]), TRUTH_HEIGHT)
         vectors = [(length * math.cos(pose.theta), length * math.sin(pose.theta), 0.0) for pose in poses]
-        self._send_columns(f"{SCENE}/laser", index, rr.Arrows3D.columns(vectors=vectors, origins=origins))
-        self._set_style(
-            f"{SCENE}/laser", rr.Arrows3D.from_fields(colors=[LASER_COLOR], radii=rr.Radius.ui_points(2.5))
-        )
+        self._send_columns(path, index, rr.Arrows3D.columns(vectors=vectors, origins=origins))
+        self._set_style(path, rr.Arrows3D.from_fields(colors=[LASER_COLOR], radii=rr.Radius.ui_points(2.5)))
 
     def _send_ellipses(self, entries: list[ScanEntry]) -> None:
         """Send the laser's 95 % confidence ellipses, where its poses have covariances."""

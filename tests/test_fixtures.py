@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from prim.log import open_log
-from prim.log.messages import SCAN_TOPIC, decode_scan
+from prim.log.messages import SCAN_TOPIC
 from replay.ground_truth import GroundTruth
 from replay.keywords import replay_options
 from replay.outputs.report import report_json
@@ -46,7 +46,7 @@ def test_there_are_fixtures() -> None:
 @pytest.mark.parametrize("path", LOGS, ids=name_of)
 def test_logs_stay_readable(path: Path) -> None:
     with open_log(path) as log:
-        scans = [scan for _, scan in log.decoded(log.topics[SCAN_TOPIC], decode_scan)]
+        scans = [scan for _, scan in log.decoded(log.topics[SCAN_TOPIC])]
         truth = GroundTruth.read(log)
         assert log.metadata["prim"]["version"].startswith(path.parent.name) and not log.lost
     report = json.loads(next(path.parent.glob(f"{path.stem}.*.report.json")).read_text())
@@ -62,5 +62,5 @@ def test_reports_keep_their_keys(path: Path) -> None:
     now = json.loads(json.dumps(report_json(Pipeline(log, options).run())))
     assert now["schema"] == before["schema"]
     assert of_kinds(set(keys_of(before))) <= of_kinds(set(keys_of(now)))
-    assert now["log"] == before["log"] | {"path": str(log)}
+    assert now["log"] == before["log"] | {"path": str(log), "format": "MCAP"}
     assert now["map"]["cells"] == before["map"]["cells"]

@@ -20,7 +20,8 @@ PARTS = ("prim", "mapping", "detect", "recorder", "replay")
 
 ARROWS: dict[str, set[str]] = {
     "prim": set(),
-    "prim/log": {"prim"},
+    "prim/log/decoding": {"prim"},
+    "prim/log": {"prim", "prim/log/decoding"},
     "recorder": {"prim", "prim/log"},
     "mapping": {"prim", "mapping/forward"},
     "mapping/forward": {"prim", "mapping"},
@@ -28,23 +29,24 @@ ARROWS: dict[str, set[str]] = {
     "detect/refinement": {"prim", "mapping", "detect"},
     "detect": {"prim", "mapping", "detect/networks"},
     "detect/training": {
-        "prim", "prim/log", "recorder", "mapping", "detect", "detect/networks",
+        "prim", "prim/log", "prim/log/decoding", "recorder", "mapping", "detect", "detect/networks",
     },
     "detect/evaluation": {
         "prim", "recorder", "mapping", "detect", "detect/networks", "detect/refinement",
         "detect/training",
     },
-    "replay/poses": {"prim", "prim/log", "mapping", "mapping/forward"},
+    "replay/scans": {"prim", "prim/log", "prim/log/decoding", "replay", "replay/poses"},
+    "replay/poses": {"prim", "prim/log", "prim/log/decoding", "mapping", "mapping/forward"},
     "replay/detection": {
-        "prim", "mapping", "detect", "detect/networks", "detect/refinement", "replay", "replay/poses",
+        "prim", "mapping", "detect", "detect/networks", "detect/refinement", "replay", "replay/poses", "replay/scans",
     },
     "replay/outputs": {"prim", "mapping", "detect", "replay", "replay/detection", "replay/poses"},
     "replay/viewing": {
         "prim", "mapping", "detect", "replay", "replay/detection", "replay/outputs", "replay/poses",
     },
     "replay": {
-        "prim", "prim/log", "mapping", "mapping/forward", "detect", "detect/networks", "detect/refinement",
-        "replay/detection", "replay/outputs", "replay/poses", "replay/viewing",
+        "prim", "prim/log", "prim/log/decoding", "mapping", "mapping/forward", "detect", "detect/networks",
+        "detect/refinement", "replay/scans", "replay/detection", "replay/outputs", "replay/poses", "replay/viewing",
     },
 }  # fmt: skip
 """For each folder the folders that its files may import from, beside itself."""
@@ -60,9 +62,10 @@ ENDS = {
     ("detect/refinement", "detect"): {"detection"},
     ("replay/viewing", "replay"): {"result"},
     ("replay/viewing", "replay/outputs"): {"report"},
+    ("replay/scans", "replay"): {"notes", "timing"},
     ("replay/viewing", "replay/detection"): {"stage"},
     ("replay/outputs", "replay"): {"result", "notes"},
-    ("replay/detection", "replay"): {"ground_truth", "intervals", "options", "posed_scans", "timing"},
+    ("replay/detection", "replay"): {"ground_truth", "intervals", "options", "timing"},
 }
 """Arrows that lead to these files of a folder alone."""
 

@@ -37,7 +37,8 @@ from prim import strict_json
 from prim.errors import OutputError, UsageError
 from prim.files import ResultFormat, output_errors, write_file
 from prim.log import open_log
-from prim.log.messages import POSE_TYPE, SCAN_TOPIC, TRUE_POSE_TOPIC, decode_poses, decode_scan, planar_pose
+from prim.log.decoding.values import planar_pose
+from prim.log.messages import SCAN_TOPIC, TRUE_POSE_TOPIC
 from prim.processes import process_pool
 from prim.scan import Scan
 from prim.se2 import Pose2D, Trajectory
@@ -322,16 +323,12 @@ def read_scans(path: Path) -> list[tuple[Scan, Pose2D]]:
     """Read a recorded log's scans with the laser's true poses (map frame), interpolated to their stamps."""
     with open_log(path) as log:
         topics = log.topics
-        stamped = [
-            pose
-            for _, poses in log.decoded(topics[TRUE_POSE_TOPIC], lambda data: decode_poses(POSE_TYPE, data))
-            for pose in poses
-        ]
+        stamped = [pose for _, poses in log.decoded(topics[TRUE_POSE_TOPIC]) for pose in poses]
         planes = [planar_pose(pose) for pose in stamped]
         truth = Trajectory.from_unsorted(
             [pose.stamp for pose in stamped], [(pose.x, pose.y, pose.theta) for pose in planes]
         )
-        scans = [scan for _, scan in log.decoded(topics[SCAN_TOPIC], decode_scan)]
+        scans = [scan for _, scan in log.decoded(topics[SCAN_TOPIC])]
     at, _ = truth.at(np.array([scan.stamp for scan in scans], dtype=np.int64))
     return [(scan, Pose2D(*pose)) for scan, pose in zip(scans, at.tolist(), strict=True)]
 

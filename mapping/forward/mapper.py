@@ -489,7 +489,9 @@ def check_size(frame: GridFrame, options: ForwardOptions = DEFAULTS) -> None:
     if frame.rows * frame.cols > options.max_cells:
         raise MapSizeError(
             f"a map of {frame.rows * frame.cols / 1e6:.0f} million cells is too large for --mapper forward "
-            f"(at most {options.max_cells / 1e6:.0f} million)"
+            f"(at most {options.max_cells / 1e6:.0f} million)",
+            frame.resolution,
+            frame.rows * frame.cols / options.max_cells,
         )
 
 

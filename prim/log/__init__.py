@@ -2,24 +2,27 @@
 
 from __future__ import annotations
 
-import stat
-from collections.abc import Callable
+import shlex
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from prim.errors import LogReadError
 
 if TYPE_CHECKING:
+    from prim.log.log_file import LogFile
+    from prim.log.reader import LogReader
     from prim.log.source import LogSource
 
 __all__ = ["open_log"]
 
 
 def open_log(path: str | Path, recover: bool = False) -> LogSource:
-    """Open a log for reading; its format is found by its first bytes.
+    """Open a log for reading; its format is found by its content, whatever its name.
 
     Args:
-        path: An MCAP file, or a folder with one in it (a ROS 2 bag).
+        path: An MCAP file, a ROS 2 bag's folder or .db3 file, a ROS 1 bag, or a log of CARMEN; compressed or not, by
+            zstd or gzip.
         recover: Read what is left of a damaged log.
 
     Returns:
@@ -28,56 +31,103 @@ def open_log(path: str | Path, recover: bool = False) -> LogSource:
     Raises:
         LogReadError: The file cannot be read, is damaged (unless ``recover``), or is no log of a known format.
     """
-    file = _log_file(Path(path))
-    start = _first_bytes(file)
+    from prim.log.parts import METADATA, files_of_bag, notes_on_part, notes_on_unlisted
+
+    path = Path(path)
+    if path.name == METADATA:
+        path = path.parent
+    if not path.is_dir():
+        log = _open_file(path, recover)
+        log.notes += notes_on_part(path)
+        return log
+    try:
+        files = files_of_bag(path)
+        unlisted = notes_on_unlisted(path, files)
+    except OSError as error:
+        raise LogReadError(path, f"cannot open: {error.strerror}") from error
+    log = _open_files(path, files, recover)
+    log.notes += unlisted
+    return log
+
+
+def _open_files(path: Path, files: Sequence[Path], recover: bool) -> LogReader:
+    from prim.log.parts import PartsReader
+
+    if len(files) == 1 and files[0].exists():
+        return _open_file(files[0], recover)
+    return PartsReader(path, files, recover, lambda file: _open_file(file, recover))
+
+
+def _open_file(path: Path, recover: bool) -> LogReader:
+    """Open a file that is a log, or is one when it is unpacked."""
+    from prim.log.log_file import LogFile
+
+    file = LogFile(path, recover)
+    try:
+        return _opener(file)(file, recover)
+    except BaseException:
+        file.close()
+        raise
+
+
+def _opener(file: LogFile) -> Callable[[LogFile, bool], LogReader]:
+    """Return what opens a log of this content. Raises LogReadError."""
     for magic, open_source in _SOURCES.items():
-        if start.startswith(magic):
-            return open_source(file, recover)
-    if not start:
-        raise LogReadError(file, "an empty file (0 bytes)", "give an .mcap log")
+        if file.head.startswith(magic):
+            return open_source
     for magic, (what, hint) in _UNSUPPORTED.items():
-        if start.startswith(magic):
-            raise LogReadError(file, f"{what}, not an MCAP log", hint)
-    raise LogReadError(file, "not an MCAP log: it begins with other bytes", "give an .mcap log")
+        if file.head.startswith(magic):
+            raise LogReadError(file.path, f"{what}, not a log", hint.format(shlex.quote(str(file.path))))
+    if file.head[TAR_AT:].startswith(TAR_MAGIC):
+        raise LogReadError(
+            file.path, "a tar archive, not a log", f"unpack it with: tar -xf {shlex.quote(str(file.path))}"
+        )
+    if not file.head:
+        raise LogReadError(file.path, "an empty file (0 bytes)", _KNOWN)
+    from prim.log import carmen
+
+    if carmen.START.match(file.head):
+        return carmen.CarmenReader
+    raise LogReadError(file.path, "not a log of a known format: it begins with other bytes", _KNOWN)
 
 
-def _open_mcap(path: Path, recover: bool) -> LogSource:
+def _open_mcap(file: LogFile, recover: bool) -> LogReader:
     from prim.log.mcap import McapReader  # when it is needed: writing a log does without it
 
-    return McapReader(path, recover)
+    return McapReader(file, recover)
 
 
-_SOURCES: dict[bytes, Callable[[Path, bool], LogSource]] = {b"\x89MCAP0\r\n": _open_mcap}
+def _open_bag(file: LogFile, recover: bool) -> LogReader:
+    from prim.log.bags import RecoveredBagReader, Ros1BagReader
+
+    return RecoveredBagReader(file) if recover else Ros1BagReader(file)
+
+
+def _open_sqlite(file: LogFile, recover: bool) -> LogReader:
+    from prim.log.sqlite import SqliteBagReader
+
+    return SqliteBagReader(file, recover)
+
+
+_SOURCES: dict[bytes, Callable[[LogFile, bool], LogReader]] = {
+    b"\x89MCAP0\r\n": _open_mcap,
+    b"#ROSBAG V2": _open_bag,
+    b"SQLite format 3\0": _open_sqlite,
+}
 """How a log is opened, by the first bytes of its file."""
 
 _UNSUPPORTED = {
-    b"#ROSBAG": ("a ROS 1 bag", "convert it with: rosbags-convert --dst-storage mcap"),
-    b"SQLite format 3": ("a ROS 2 bag in SQLite", "convert it with: rosbags-convert --dst-storage mcap"),
-    b"\x89PNG": ("a PNG image", "give an .mcap log"),
-    b"RRF2": ("a rerun recording", "open it with: rerun FILE"),
+    b"\x89PNG": ("a PNG image", "give a log"),
+    b"RRF2": ("a rerun recording", "open it with: rerun {}"),
+    b"#ROSBAG V1": ("a ROS 1 bag of the old format 1.2", "convert it with: rosbag fix {0} {0}.v2.bag"),
+    b"PK\x03\x04": ("a ZIP archive", "unpack it with: unzip {}"),
+    b"BZh": ("compressed by bzip2", "unpack it with: bunzip2 --keep {}"),
+    b"\xfd7zXZ\0": ("compressed by xz", "unpack it with: unxz --keep {}"),
+    b"\x04\x22\x4d\x18": ("compressed by lz4", "unpack it with: unlz4 {}"),
 }
 """First bytes of files that cannot be read, what they are, and what to do."""
 
+TAR_AT, TAR_MAGIC = 257, b"ustar"
+"""What tells a tar archive, and at which byte."""
 
-def _first_bytes(path: Path) -> bytes:
-    """Return as many bytes of a file's start as tell its format. Raises LogReadError."""
-    try:
-        if not stat.S_ISREG(path.stat().st_mode):
-            raise LogReadError(path, "a pipe or a device, which cannot be read back and forth", "save it to a file")
-        with path.open("rb") as stream:
-            return stream.read(max(map(len, (*_SOURCES, *_UNSUPPORTED))))
-    except OSError as error:
-        raise LogReadError(path, f"cannot open: {error.strerror}") from error
-
-
-def _log_file(path: Path) -> Path:
-    """Return the log's file: ``path`` itself, or the one .mcap file in the folder ``path`` (a ROS 2 bag)."""
-    if not path.is_dir():
-        return path
-    logs = sorted(path.glob("*.mcap"))
-    if len(logs) == 1:
-        return logs[0]
-    if logs:
-        names = ", ".join(log.name for log in logs)
-        raise LogReadError(path, f"a folder with {len(logs)} logs ({names})", "give one of them")
-    raise LogReadError(path, "a folder without an .mcap log in it", "give an .mcap file or a ROS 2 bag's folder")
+_KNOWN = "give an MCAP log, a ROS 1 or ROS 2 bag, or a log of CARMEN"

@@ -6,13 +6,13 @@ import os
 import struct
 import zlib
 from collections import Counter
-from collections.abc import Callable, Container, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field
 from itertools import pairwise
-from pathlib import Path
 from typing import IO, TypeVar
 
+import numpy as np
 from mcap.data_stream import RecordBuilder
 from mcap.exceptions import EndOfFile, McapError
 from mcap.opcode import Opcode
@@ -22,9 +22,14 @@ from mcap.records import Message as McapMessage
 from mcap.stream_reader import StreamReader, get_chunk_data_stream
 from mcap.summary import Summary
 
+from prim.arrays import Stamps
 from prim.errors import LogReadError
+from prim.log.decoding.codecs import SCAN_CONTENTS, content_of
+from prim.log.log_file import LogFile
+from prim.log.reader import LogReader, ros2_name
 from prim.log.recovery import RECORD_LIMIT, RECOVER_HINT, RecordReader, read_chunk, translated_errors
-from prim.log.source import Decoded, Message, Topic
+from prim.log.source import Message, Topic
+from prim.log.time_resets import find_shifts, moved_behind_resets, reset_notes
 
 MAGIC = b"\x89MCAP0\r\n"
 
@@ -35,6 +40,8 @@ _RECORD = struct.Struct("<BQ")
 """The prefix of every record: opcode and length."""
 _MESSAGE = struct.Struct("<HIQQ")
 """The prefix of a message record: channel, sequence, log time, publish time."""
+_MESSAGE_INDEX = struct.Struct("<BQHI")
+"""The start of an index of messages: opcode, length, channel, and the length of its entries (log time, offset)."""
 
 
 @dataclass
@@ -47,26 +54,25 @@ class _Contents:
     metadata: dict[str, Mapping[str, str]] = field(default_factory=dict)
 
 
-class McapReader:
+class McapReader(LogReader):
     """An MCAP log that is open for reading: a :class:`prim.log.source.LogSource`.
 
     An intact log is read by its index, in the order of log times. With ``recover``, every log is read chunk by chunk,
     by the index of chunks where that is intact and else in file order.
 
     Args:
-        path: The file; it begins with MAGIC, as :func:`prim.log.open_log` checks.
+        file: The file; it begins with MAGIC, as :func:`prim.log.open_log` checks.
         recover: Pass over damage, and collect it in :attr:`lost`.
 
     Raises:
         LogReadError: The file cannot be read or is damaged (unless ``recover``).
     """
 
-    def __init__(self, path: Path, recover: bool = False) -> None:
-        self.path = path
-        self.lost: list[str] = []
-        self._recover = recover
-        self._undecodable: set[tuple[str, int]] = set()
-        self._file: IO[bytes] = path.open("rb")
+    _FORMAT = "MCAP"
+
+    def __init__(self, file: LogFile, recover: bool = False) -> None:
+        super().__init__(file.path, recover, file)
+        self._file: IO[bytes] = file.data.open("rb")
         self._records = RecordReader(self._file, self.path, recover)
         self._index = SeekingReader(self._file, validate_crcs=True, record_size_limit=RECORD_LIMIT)
         try:
@@ -75,30 +81,23 @@ class McapReader:
         except BaseException:
             self._file.close()
             raise
+        self.metadata, self.topics = self._contents.metadata, self._read_topics()
+        self._shifts = self._find_shifts()
 
-    def __enter__(self) -> McapReader:
-        return self
-
-    def __exit__(self, *exception: object) -> None:
+    def close(self) -> None:
+        """Close the file."""
         self._file.close()
 
-    @property
-    def topics(self) -> dict[str, Topic]:
-        """The log's topics by name."""
+    def _read_topics(self) -> dict[str, Topic]:
         topics: dict[str, Topic] = {}
         for channel in self._contents.channels.values():
             schema = self._contents.schemas.get(channel.schema_id)
             count = self._contents.counts[channel.id]
             if channel.topic in topics:
                 count += topics[channel.topic].messages
-            name = schema.name if schema else ""
-            topics[channel.topic] = Topic(channel.topic, _ros2_name(name), channel.message_encoding, count)
+            name = ros2_name(schema.name if schema else "")
+            topics[channel.topic] = Topic(channel.topic, name, channel.message_encoding, count, content_of(name))
         return topics
-
-    @property
-    def metadata(self) -> Mapping[str, Mapping[str, str]]:
-        """The log's metadata records by name."""
-        return self._contents.metadata
 
     def attachment(self, name: str) -> bytes | None:
         """See :meth:`prim.log.source.LogSource.attachment`."""
@@ -132,13 +131,11 @@ class McapReader:
         unread = self._summary.statistics.message_count - self._contents.counts.total()
         return unread + len(self._undecodable)
 
-    def of_type(self, *types: str) -> list[Topic]:
-        """See :meth:`prim.log.source.LogSource.of_type`."""
-        fitting = (topic for topic in self.topics.values() if topic.type in types and topic.messages)
-        return sorted(fitting, key=lambda topic: topic.name)
-
     def messages(self, *topics: str) -> Iterator[Message]:
         """See :meth:`prim.log.source.LogSource.messages`; a log that is recovered is read in file order."""
+        if len(self._shifts) > 1:
+            yield from moved_behind_resets(self._unindexed_messages(topics), self._shifts)
+            return
         if self._recover or self._summary is None or not self._summary.chunk_indexes:
             yield from self._unindexed_messages(topics)
             return
@@ -151,6 +148,15 @@ class McapReader:
             if name in self.topics and delivered[name] != self.topics[name].messages:
                 what = f"{name} has {delivered[name]} messages where the summary counts {self.topics[name].messages}"
                 raise LogReadError(self.path, f"damaged: {what}", RECOVER_HINT)
+
+    def log_times(self, topic: str) -> Stamps:
+        """See :meth:`prim.log.reader.LogReader.log_times`: by the index where there is one."""
+        if self._recover or self._summary is None or not self._summary.chunk_indexes or len(self._shifts) > 1:
+            return super().log_times(topic)
+        numbers = [number for number, channel in self._contents.channels.items() if channel.topic == topic]
+        with translated_errors(self.path):
+            times = [part for number in numbers for part in self._written_times(self._summary, number)]
+        return np.sort(np.concatenate(times)) if times else np.zeros(0, dtype=np.int64)
 
     def _indexed_messages(self, summary: Summary, topics: tuple[str, ...]) -> Iterator[Message]:
         """Yield messages in the order of log times, by the index of chunks.
@@ -171,45 +177,39 @@ class McapReader:
             stream, length = get_chunk_data_stream(read_chunk(self._file, index), validate_crc=True)
             yield from sorted(_chunk_messages(stream.read(length), wanted), key=lambda message: message.log_time)
 
+    def _find_shifts(self) -> tuple[int, ...]:
+        """Find out whether the log's times were set back, and note that."""
+        scans = {k for k, c in self._contents.channels.items() if self.topics[c.topic].content in SCAN_CONTENTS}
+        if not scans:
+            return (0,)
+        if self._recover or self._summary is None or not self._summary.chunk_indexes:
+            name = self._contents.channels[min(scans)].topic
+            times = [message.log_time for message in self._unindexed_messages((name,))]
+            shifts = find_shifts(np.array(times, dtype=np.int64))
+        else:
+            with translated_errors(self.path):
+                parts = list(self._written_times(self._summary, min(scans)))
+                shifts = find_shifts(np.concatenate(parts)) if parts else (0,)
+        self.notes = reset_notes(shifts)
+        return shifts
+
+    def _written_times(self, summary: Summary, channel: int) -> Iterator[Stamps]:
+        """Yield for each chunk when messages of a channel were logged (ns), in the order of writing."""
+        for chunk in sorted(summary.chunk_indexes, key=lambda index: index.chunk_start_offset):
+            at = chunk.message_index_offsets.get(channel)
+            if at is not None:
+                self._file.seek(at)
+                opcode, _, _, size = _MESSAGE_INDEX.unpack(self._file.read(_MESSAGE_INDEX.size))
+                entries = np.frombuffer(self._file.read(size), "<u8").reshape(-1, 2)
+                if opcode != Opcode.MESSAGE_INDEX:
+                    raise McapError(f"no index of messages at byte {at}")
+                yield entries[np.argsort(entries[:, 1], kind="stable"), 0].astype(np.int64)
+
     def _unindexed_messages(self, topics: tuple[str, ...]) -> Iterator[Message]:
         names = {number: channel.topic for number, channel in self._contents.channels.items()}
         for record in self._all_records([]):
             if isinstance(record, McapMessage) and names.get(record.channel_id) in topics:
                 yield Message(names[record.channel_id], record.log_time, record.data)
-
-    def decoded(self, topic: Topic, decode: Callable[[bytes], Decoded]) -> Iterator[tuple[int, Decoded]]:
-        """See :meth:`prim.log.source.LogSource.decoded`."""
-        for _, log_time, decoded in self.numbered(topic, decode):
-            yield log_time, decoded
-
-    def numbered(
-        self, topic: Topic, decode: Callable[[bytes], Decoded], wanted: Container[int] | None = None
-    ) -> Iterator[tuple[int, int, Decoded]]:
-        """See :meth:`prim.log.source.LogSource.numbered`."""
-        if topic.encoding != "cdr":
-            raise LogReadError(
-                self.path,
-                f"{topic.name} is encoded as {topic.encoding!r}, and only 'cdr' (ROS 2) can be read",
-                "convert the log with: rosbags-convert --dst-storage mcap",
-            )
-        for index, message in enumerate(self.messages(topic.name)):
-            if wanted is not None and index not in wanted:
-                continue
-            try:
-                decoded = decode(message.data)
-            except ValueError as error:
-                self._reject(topic, index, error)
-                continue
-            yield index, message.log_time, decoded
-
-    def _reject(self, topic: Topic, index: int, error: ValueError) -> None:
-        """Count a message that cannot be decoded as lost; unless recovering, raise LogReadError."""
-        if not self._recover:
-            what = f"message {index} of {topic.name} cannot be decoded: {error}"
-            raise LogReadError(self.path, what, "pass over such messages with --recover")
-        if not any(name == topic.name for name, _ in self._undecodable):
-            self.lost.append(f"messages of {topic.name} that cannot be decoded, the first one {index}: {error}")
-        self._undecodable.add((topic.name, index))
 
     def _read_summary(self) -> Summary | None:
         """Read the log's summary and check its CRC; None where a complete log has none. Raises LogReadError."""
@@ -283,12 +283,6 @@ class McapReader:
         if self._summary is None or not self._summary.chunk_indexes:
             return self._records.linear(lost)
         return self._records.indexed(self._summary.chunk_indexes, lost)
-
-
-def _ros2_name(name: str) -> str:
-    """Return the ROS 2 name of a message type: of ROS 1's package/Type, package/msg/Type."""
-    parts = name.split("/")
-    return f"{parts[0]}/msg/{parts[1]}" if len(parts) == 2 else name
 
 
 Record = TypeVar("Record", Metadata, Attachment)

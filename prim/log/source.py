@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Container, Iterator, Mapping, Sequence
+from collections.abc import Container, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import NamedTuple, Protocol, Self, TypeVar
+from typing import Any, NamedTuple, Protocol, Self
 
-Decoded = TypeVar("Decoded")
+from prim.log.decoding.codecs import Content
 
 
 class Topic(NamedTuple):
@@ -14,15 +14,17 @@ class Topic(NamedTuple):
 
     Attributes:
         name: Its name.
-        type: The type of its messages, by its ROS 2 name (package/msg/Type).
+        type: The type of its messages: of ROS messages the name in ROS 2 (package/msg/Type).
         encoding: How they are serialized: «cdr» for ROS 2.
         messages: The number of messages.
+        content: What they hold; None where that is of no use here.
     """
 
     name: str
     type: str
     encoding: str
     messages: int
+    content: Content | None = None
 
 
 class Message(NamedTuple):
@@ -39,6 +41,22 @@ class Message(NamedTuple):
     data: bytes
 
 
+class Numbered(NamedTuple):
+    """A decoded message.
+
+    Attributes:
+        number: Which message it is among those that are read.
+        topic: The name of its topic.
+        log_time: When it was logged (ns).
+        value: The message as :class:`prim.log.decoding.codecs.Content` defines it for the topic's content.
+    """
+
+    number: int
+    topic: str
+    log_time: int
+    value: Any
+
+
 class LogSource(Protocol):
     """A log that is open for reading, in bounded memory; a context manager that closes it.
 
@@ -48,7 +66,12 @@ class LogSource(Protocol):
 
     @property
     def path(self) -> Path:
-        """The log's file."""
+        """The log's file or folder."""
+        ...
+
+    @property
+    def format(self) -> str:
+        """Its format, for people."""
         ...
 
     @property
@@ -71,6 +94,11 @@ class LogSource(Protocol):
         """The number of messages that could not be read; None where the log does not say how many there were."""
         ...
 
+    @property
+    def notes(self) -> Sequence[str]:
+        """What a user should know of how the log is read."""
+        ...
+
     def __enter__(self) -> Self: ...
 
     def __exit__(self, *exception: object) -> None: ...
@@ -79,42 +107,52 @@ class LogSource(Protocol):
         """Return the attachment of this name, None where there is none. Raises LogReadError."""
         ...
 
-    def of_type(self, *types: str) -> list[Topic]:
-        """Return the topics that have messages and are of any of these types, sorted by name."""
+    def holding(self, *contents: Content) -> list[Topic]:
+        """Return the topics that have messages and hold any of these, sorted by name."""
         ...
 
     def messages(self, *topics: str) -> Iterator[Message]:
         """Yield the messages of these topics by log time. Raises LogReadError where any is missing or damaged."""
         ...
 
-    def decoded(self, topic: Topic, decode: Callable[[bytes], Decoded]) -> Iterator[tuple[int, Decoded]]:
+    def decoded(self, topic: Topic) -> Iterator[tuple[int, Any]]:
         """Yield the decoded messages of one topic by log time.
 
         Args:
             topic: The topic.
-            decode: Decodes a serialized message; raises ValueError on bytes that are not one.
 
         Yields:
-            Log time (ns) and decoded message.
+            Log time (ns), and the message, as what :class:`prim.log.decoding.codecs.Content` says.
 
         Raises:
             LogReadError: A message is missing, damaged, or cannot be decoded.
         """
         ...
 
-    def numbered(
-        self, topic: Topic, decode: Callable[[bytes], Decoded], wanted: Container[int] | None = None
-    ) -> Iterator[tuple[int, int, Decoded]]:
-        """Yield decoded messages as :meth:`decoded`, with their indices.
+    def numbered(self, *topics: Topic, wanted: Container[int] | None = None) -> Iterator[Numbered]:
+        """Yield the decoded messages of one or several topics by log time, with their indices.
 
         Args:
-            topic: The topic.
-            decode: As in :meth:`decoded`.
-            wanted: The indices to decode and yield; None: all. The whole topic is read even so: only its end shows
-                whether messages are missing.
+            *topics: The topics.
+            wanted: The indices to decode and yield; None: all. The whole topics are read even so: only their end
+                shows whether messages are missing.
 
         Yields:
-            The message's index on its topic, its log time (ns), and the decoded message.
+            The messages; their indices count those of these topics together.
+
+        Raises:
+            LogReadError: As in :meth:`decoded`.
+        """
+        ...
+
+    def stamps(self, *topics: Topic) -> Iterator[Numbered]:
+        """Yield the stamps of messages, which is faster than decoding all of them.
+
+        Args:
+            *topics: As in :meth:`numbered`.
+
+        Yields:
+            As :meth:`numbered`; the values are the stamps of their headers (ns).
 
         Raises:
             LogReadError: As in :meth:`decoded`.

@@ -24,7 +24,7 @@ from replay.detection.refiner import DetectionRefiner
 from replay.ground_truth import GroundTruth
 from replay.intervals import detection_interval, is_due
 from replay.options import ReplayOptions
-from replay.posed_scans import PosedScans
+from replay.scans.posed_scans import PosedScans
 from replay.timing import StageTimer
 
 if TYPE_CHECKING:
@@ -249,7 +249,9 @@ def make_detection_stage(
     weights = options.weights or shipped_weights(options.mapper)
     try:
         if weights is None:
-            raise UsageError(f"no weights for maps of {options.mapper} come with prim: give --weights")
+            raise UsageError(
+                f"no weights for maps of {options.mapper} come with prim: give --weights, or --no-detect"
+            )
         detector = _load(weights, options.mapper, timer)
         return DetectionStage(detector, options, frame, posed_scans, truth, is_shown, timer)
     except (UsageError, WeightsError) as error:

@@ -33,8 +33,8 @@ TRAJECTORY = ResultFormat(
     "a trajectory of prim-replay", re.compile(rb"\d+\.\d{9}( -?\d+\.\d{9}){2} 0 0 0( -?\d\.\d{9}){2}\n")
 )
 
-_LOG_SUFFIX = re.compile(r"(\.mcap)?(\.[0-9a-f]{8})?\.part$|\.mcap$")
-"""The suffix of a log, or of one that its recorder was killed at."""
+_LOG_SUFFIX = re.compile(r"(\.mcap)?(\.[0-9a-f]{8})?\.part$|\.(mcap|db3|bag|log)(\.(zst|zstd|gz))?$")
+"""The suffix of a log, compressed or not, or of one that its recorder was killed at."""
 
 FREE_THRESHOLD, OCCUPIED_THRESHOLD = 0.196, 0.65
 OCCUPIED_VALUE, UNKNOWN_VALUE, FREE_VALUE = 0, 205, 254
@@ -76,7 +76,7 @@ def write_map(stem: Path, grid: OccupancyGrid, force: bool = False) -> None:
 
 
 def write_trajectory(path: Path, result: ReplayResult, force: bool = False) -> None:
-    """Write the laser's poses in TUM's format (stamp x y z qx qy qz qw; s, m).
+    """Write the poses of the laser, of several of the first, in TUM's format (stamp x y z qx qy qz qw; s, m).
 
     Args:
         path: The file.
@@ -88,8 +88,9 @@ def write_trajectory(path: Path, result: ReplayResult, force: bool = False) -> N
         UsageError: There is another file in its place.
     """
     lines = []
-    for stamp, pose, valid in zip(result.stamps.tolist(), result.poses.poses, result.poses.valid, strict=True):
-        if valid:
+    written = result.poses.valid & (result.scanner == 0)
+    for stamp, pose, is_written in zip(result.stamps.tolist(), result.poses.poses, written, strict=True):
+        if is_written:
             x, y, half = pose[0], pose[1], pose[2] / 2
             seconds = f"{stamp // 10**9}.{stamp % 10**9:09d}"
             lines.append(f"{seconds} {x:.9f} {y:.9f} 0 0 0 {np.sin(half):.9f} {np.cos(half):.9f}\n")

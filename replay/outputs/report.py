@@ -67,6 +67,7 @@ def _report(result: ReplayResult) -> dict[str, Any]:
         "schema": SCHEMA,
         "log": {
             "path": printable(str(result.path)),
+            "format": result.format,
             "duration_s": result.duration,
             "scans": result.scans,
             "scans_used": result.scans_used,

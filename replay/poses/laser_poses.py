@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from prim.arrays import FloatArray, Stamps
-from prim.choices import PoseSourceName
+from prim.choices import PoseSourceName, SweepName
 from prim.se2 import Pose2D
 
 if TYPE_CHECKING:
@@ -26,24 +26,81 @@ EXACT_SOURCES = (PoseSourceName.TRUTH.value, STILL)
 """The sources of poses without errors."""
 
 
+class BeamTimes(NamedTuple):
+    """When a scan's first and last beams are measured: from its stamp on, in units of the time that a sweep takes."""
+
+    first: float
+    last: float
+
+
+BEAM_TIMES: Mapping[str, BeamTimes] = {
+    SweepName.START.value: BeamTimes(0.0, 1.0),
+    SweepName.END.value: BeamTimes(-1.0, 0.0),
+    SweepName.START_REVERSED.value: BeamTimes(1.0, 0.0),
+    SweepName.END_REVERSED.value: BeamTimes(0.0, -1.0),
+}
+"""The times of beams by the name of the option."""
+
+AT_ONCE = BeamTimes(0.0, 0.0)
+"""All beams are measured at the stamp."""
+
+
+def stated_beam_times(sweep: int) -> BeamTimes:
+    """Return what a log says of its beams: they follow the stamp, or go before it where time_increment is negative.
+
+    Args:
+        sweep: The time (ns) from a scan's first beam to its last.
+
+    Returns:
+        The times of the beams.
+    """
+    return BEAM_TIMES[SweepName.START if sweep >= 0 else SweepName.END_REVERSED]
+
+
 @dataclass(frozen=True)
 class ScanTimes:
-    """When N scans were taken.
+    """When N scans were taken, by one laser or by several.
 
     Attributes:
         stamps: Of each scan's first beam (N,) in ns.
-        frame_id: The laser's frame.
-        sweep: The time (ns) from a scan's first beam to its last; 0: all beams are taken at once.
+        frame_ids: The frame of each laser.
+        sweeps: For each laser the time (ns) from a scan's first beam to its last, negative where they run against
+            time; 0: all beams are taken at once. Empty: 0 for all.
+        scanner: By which laser each scan was taken (N,); None: by the only one.
+        topics: The topic of each laser's scans; empty where there is one laser.
     """
 
     stamps: Stamps
-    frame_id: str
-    sweep: int = 0
+    frame_ids: tuple[str, ...]
+    sweeps: tuple[int, ...] = ()
+    scanner: NDArray[np.intp] | None = None
+    topics: tuple[str, ...] = ()
 
     @property
     def query_stamps(self) -> Stamps:
         """When poses are asked for: at the first beams (N,) and, where a sweep takes time, the last ones (2N,)."""
-        return np.concatenate((self.stamps, self.stamps + self.sweep)) if self.sweep else self.stamps
+        if not any(self.sweeps):
+            return self.stamps
+        sweeps = np.array(self.sweeps, dtype=np.int64)[self._scanner]
+        return np.concatenate((self.stamps, self.stamps + sweeps))
+
+    @property
+    def sweep(self) -> int:
+        """The time (ns) of the first laser's sweep."""
+        return self.sweeps[0] if self.sweeps else 0
+
+    def query_rows(self, laser: int) -> NDArray[np.intp]:
+        """Return which of the query stamps are those of a laser."""
+        rows = np.flatnonzero(self._scanner == laser)
+        return np.concatenate((rows, rows + len(self.stamps))) if any(self.sweeps) else rows
+
+    def at_once(self) -> ScanTimes:
+        """Return the same scans, all beams of each taken at its stamp."""
+        return replace(self, sweeps=())
+
+    @property
+    def _scanner(self) -> NDArray[np.intp]:
+        return np.zeros(len(self.stamps), dtype=np.intp) if self.scanner is None else self.scanner
 
 
 @dataclass(frozen=True)
@@ -77,7 +134,7 @@ class LaserPoses:
         origin: The topics or frames that the poses come from, for people.
         poses: (N, 3) x, y (m), heading (rad) in the map frame.
         valid: Which scans (N,) lie within the time of the poses.
-        upside_down: Whether the laser turns the other way.
+        upside_down: At which scans (N,) the laser turns the other way; None: at none.
         notes: What a user should know: what was assumed or left out.
         end_poses: The poses (N, 3) at each scan's last beam; None: those at the first.
         covariances: The poses' covariances (N, 3, 3), where they are known.
@@ -85,15 +142,16 @@ class LaserPoses:
             is known.
         sensors: The sensors that the poses were fused from.
         fusion: The fusion that they come from.
-        mounts: The laser's poses (N, 3) on the robot whose poses were fused.
+        mounts: The laser's poses (N, 3) on the robot, where poses were fused or there are several lasers.
         matched: Whether the poses are corrected by matching the scans with the map.
+        mount_assumed: Whether the laser is only taken to be at the robot's origin: its mount is not in the log.
     """
 
     source: str
     origin: str
     poses: FloatArray
     valid: NDArray[np.bool_]
-    upside_down: bool = False
+    upside_down: NDArray[np.bool_] | None = None
     notes: tuple[str, ...] = ()
     end_poses: FloatArray | None = None
     covariances: FloatArray | None = None
@@ -102,6 +160,7 @@ class LaserPoses:
     fusion: Fusion | None = None
     mounts: FloatArray | None = None
     matched: bool = False
+    mount_assumed: bool = False
 
     @property
     def max_std(self) -> tuple[float, float] | None:
@@ -118,6 +177,10 @@ class LaserPoses:
         covariance = None if self.covariances is None else self.covariances[position]
         x, y, theta = self.poses[position].tolist()
         return Pose2D(x, y, theta, covariance)
+
+    def is_upside_down(self, position: int) -> bool:
+        """Return whether the laser is mounted upside down that took the scan at this index."""
+        return self.upside_down is not None and bool(self.upside_down[position])
 
     def end_at(self, position: int) -> Pose2D | None:
         """Return the pose at the last beam of the scan at this index; None where that is taken with the first."""

@@ -4,20 +4,23 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
+from typing import NamedTuple
 
 import numpy as np
 
 from prim.arrays import FloatArray, Stamps
 from prim.errors import LogReadError
-from prim.log.messages import BASE_FRAME, MAP_FRAME, POSE_TYPE, TRUE_POSE_TOPIC
+from prim.log.decoding.codecs import Content
+from prim.log.messages import BASE_FRAME, MAP_FRAME, TRUE_POSE_TOPIC
 from prim.log.source import LogSource, Topic
 from prim.se2 import Pose2D, compose_covariances, compose_poses
 from replay.poses.fusion import Fusion, PoseEstimate
 from replay.poses.fusion_nodes import FusionNodes
 from replay.poses.fusion_options import COMPASS, GPS, ODOM, FusionInputs, FusionOptions, SensorNoise
 from replay.poses.laser_poses import FUSED, STILL, FusedSensor, LaserPoses, ScanTimes
-from replay.poses.mount import SensorMounts
+from replay.poses.mount import SensorMounts, assumed_note
 from replay.poses.sensors import (
+    REST_HINT,
     SensorLogs,
     compass_headings,
     find_compass,
@@ -28,6 +31,9 @@ from replay.poses.sensors import (
     read_sensors,
 )
 from replay.poses.transforms import project_to_plane
+
+OTHER_POSES = "take what poses there are: --pose auto"
+"""What helps where a source of poses is not there."""
 
 
 @dataclass(frozen=True)
@@ -47,6 +53,22 @@ class PoseProviderOptions:
 
 
 DEFAULTS = PoseProviderOptions()
+
+
+class _TfLink(NamedTuple):
+    """How a laser is found in tf.
+
+    Attributes:
+        chain: Frames, each followed by its parent, up to a fixed one.
+        offset: The laser's pose (1, 3) on the first of them; None: that is the laser's frame, or taken to be.
+        notes: What was assumed.
+        assumed: Whether the laser is only taken to be at the robot's origin.
+    """
+
+    chain: list[str]
+    offset: FloatArray | None
+    notes: tuple[str, ...] = ()
+    assumed: bool = False
 
 
 class PoseProvider:
@@ -73,7 +95,6 @@ class PoseProvider:
     ) -> None:
         self._log = log
         self._odom_topic = odom_topic
-        self._has_offset = laser_offset is not None
         self._inputs = inputs or FusionInputs()
         self._options = options
         self._mounts = SensorMounts(log, laser_offset, options.min_upright)
@@ -99,7 +120,7 @@ class PoseProvider:
             raise LogReadError(
                 self._log.path,
                 f"no scan (stamps {first:.3f} to {last:.3f} s) lies within the time of the poses on {poses.origin}",
-                "two clocks in one log? give another --pose or --odom-topic",
+                "two clocks in one log? by when messages were logged: --clock log",
             )
         return poses
 
@@ -112,7 +133,7 @@ class PoseProvider:
         Returns:
             The laser's poses, all valid, where the offset or tf puts it.
         """
-        mounts, upside_down, _ = self._mounts.laser_mounts(scans, BASE_FRAME)
+        mounts, upside_down, *_ = self._mounts.laser_mounts(scans, BASE_FRAME)
         valid = np.ones(len(mounts), dtype=bool)
         poses = LaserPoses(STILL, "standing still", mounts, valid, upside_down)
         return _split_end_poses(poses, len(scans.stamps))
@@ -121,7 +142,7 @@ class PoseProvider:
     def has_truth(self) -> bool:
         """Whether the log has true poses."""
         topic = self._log.topics.get(TRUE_POSE_TOPIC)
-        return topic is not None and topic.messages > 0 and topic.type == POSE_TYPE
+        return topic is not None and topic.messages > 0 and topic.content is Content.POSE
 
     def _poses_from(self, source: str, scans: ScanTimes) -> LaserPoses:
         """Return the poses at all query stamps, by the source that is asked for or that ``auto`` chooses."""
@@ -133,9 +154,9 @@ class PoseProvider:
             return self._from_odometry(scans, source)
         if source == FUSED:
             return self._from_fusion(scans)
-        chain = self._mounts.fixed_chain(scans.frame_id)
+        chains = self._tf_chains(scans)
         reason: tuple[str, ...] = ()
-        if source == "auto" and chain[-1] != MAP_FRAME:
+        if source == "auto" and not all(chain[-1] == MAP_FRAME for chain in chains):
             try:
                 if self._can_fuse():
                     return self._from_fusion(scans)
@@ -143,15 +164,26 @@ class PoseProvider:
                 if replace(self._inputs, noise=SensorNoise()) != FusionInputs():
                     raise
                 reason = (f"nothing is fused: {error.what}",)
-        use_tf = source == "tf" or len(chain) > 1
-        poses = self._from_tf(scans, chain) if use_tf else self._from_odometry(scans, source)
+        use_tf = source == "tf" or all(len(chain) > 1 for chain in chains) or self._needs_robot_in_tf(scans)
+        poses = self._from_tf(scans, chains) if use_tf else self._from_odometry(scans, source)
         return replace(poses, notes=poses.notes + reason)
+
+    def _tf_chains(self, scans: ScanTimes) -> list[list[str]]:
+        """Return the chain of frames from each laser up to a fixed frame; without one, its frame alone."""
+        return [self._mounts.fixed_chain(self._mounts.scanner_frame(frame)[0]) for frame in scans.frame_ids]
+
+    def _needs_robot_in_tf(self, scans: ScanTimes) -> bool:
+        """Return whether tf has the robot, if not the laser, where no topic has its poses."""
+        if self._mounts.robot_frame(scans.frame_ids[0]) is None:
+            return False
+        try:
+            return find_pose_topic(self._log, self._odom_topic) is None
+        except LogReadError:
+            return True
 
     def _from_truth(self, scans: ScanTimes) -> LaserPoses:
         if not self.has_truth:
-            raise LogReadError(
-                self._log.path, f"no ground truth: there is no {TRUE_POSE_TOPIC}", "give another --pose"
-            )
+            raise LogReadError(self._log.path, f"no ground truth: there is no {TRUE_POSE_TOPIC}", OTHER_POSES)
         return self._from_topic(scans, self._log.topics[TRUE_POSE_TOPIC], "truth")
 
     def _from_odometry(self, scans: ScanTimes, source: str) -> LaserPoses:
@@ -160,12 +192,12 @@ class PoseProvider:
             everything = "no ground truth, no tf chain, " if source == "auto" else ""
             raise LogReadError(
                 self._log.path,
-                f"no poses for frame {scans.frame_id!r}: {everything}no Odometry or PoseStamped",
+                f"no poses for frame {scans.frame_ids[0]!r}: {everything}no Odometry or PoseStamped",
                 "; ".join(
                     [
                         *self._mounts.tree_notes,
                         *self._log.lost,
-                        "to map with the robot at rest give --standing-still",
+                        REST_HINT,
                     ]
                 ),
             )
@@ -175,31 +207,70 @@ class PoseProvider:
         """Return the robot's poses on a topic, composed with the laser's mount."""
         odometry = read_odometry(self._log, topic)
         robot, valid = odometry.trajectory.at(scans.query_stamps)
-        mounts, upside_down, notes = self._mounts.laser_mounts(scans, odometry.base_frame or BASE_FRAME)
+        mounts, upside_down, notes, assumed = self._mounts.laser_mounts(scans, odometry.base_frame)
         notes += self._gap_note(topic.name, odometry.trajectory.stamps, scans.stamps) + odometry.notes
-        return LaserPoses(source, topic.name, compose_poses(robot, mounts), valid, upside_down, notes)
+        poses = compose_poses(robot, mounts)
+        several = mounts if len(scans.frame_ids) > 1 else None
+        return LaserPoses(source, topic.name, poses, valid, upside_down, notes, mounts=several, mount_assumed=assumed)
 
-    def _from_tf(self, scans: ScanTimes, chain: list[str]) -> LaserPoses:
-        tree = self._mounts.tree
-        if len(chain) < 2 and self._mounts.tree_notes:
+    def _from_tf(self, scans: ScanTimes, chains: Sequence[list[str]]) -> LaserPoses:
+        """Return the lasers' poses in the fixed frame of tf: by their chains, else at the robot's frame."""
+        tree, robot = self._mounts.tree, self._mounts.robot_frame(scans.frame_ids[0])
+        if self._mounts.tree_notes and not tree.edges:
             raise LogReadError(self._log.path, *self._mounts.tree_notes)
-        if len(chain) < 2:
-            frames = ", ".join(sorted({*tree.edges, *(parent for parent, _ in tree.edges.values())}))
-            raise LogReadError(
-                self._log.path,
-                f"tf has no chain from {scans.frame_id!r} to a fixed frame (its frames: {frames or 'none'})",
-                "give another --pose",
+        self._mounts.check_offset(scans)
+        stamps = scans.query_stamps
+        poses, valid = np.zeros((len(stamps), 3)), np.zeros(len(stamps), dtype=bool)
+        upside_down = np.zeros(len(stamps), dtype=bool)
+        notes: tuple[str, ...] = ()
+        origins, assumed = [], False
+        for k, frame in enumerate(scans.frame_ids):
+            rows = scans.query_rows(k)
+            link = self._tf_link(frame, chains[k], robot)
+            rotation, translation, valid[rows] = tree.lookup(link.chain, stamps[rows])
+            planar = project_to_plane(rotation, translation, self._options.min_upright)
+            poses[rows] = compose_poses(planar[0], link.offset) if link.offset is not None else planar[0]
+            upside_down[rows] = planar[1]
+            notes += planar[2] + link.notes + self._tf_notes(link.chain, scans.stamps)
+            origins.append(" > ".join(reversed(link.chain)))
+            assumed |= link.assumed
+        roots = sorted({origin.split(" > ")[0] for origin in origins})
+        if len(roots) > 1:
+            what = f"tf has the scanners in different fixed frames ({', '.join(roots)})"
+            raise LogReadError(self._log.path, what, f"choose one scanner with --scan-topic {scans.topics[0]}")
+        notes += tuple(f"{frame} has several parents in tf: {parent} is used" for frame, parent in tree.conflicts)
+        unique = tuple(dict.fromkeys(notes))
+        origin = ", ".join(origins)
+        mounts = self._mounts.laser_mounts(scans, robot or roots[0]).poses if len(scans.frame_ids) > 1 else None
+        return LaserPoses("tf", origin, poses, valid, upside_down, unique, mounts=mounts, mount_assumed=assumed)
+
+    def _tf_link(self, name: str, chain: list[str], robot: str | None) -> _TfLink:
+        """Return how a laser is found in tf: by its own chain, else by the robot's. Raises LogReadError."""
+        offset = self._mounts.offset
+        if len(chain) > 1:
+            notes = self._mounts.scanner_frame(name)[1]
+            return _TfLink(
+                chain, None, notes + ("--laser-offset is not used: tf says where the laser is",) * bool(offset)
             )
-        rotation, translation, valid = tree.lookup(chain, scans.query_stamps)
-        poses, upside_down, notes = project_to_plane(rotation, translation, self._options.min_upright)
+        if robot is None:
+            tree = self._mounts.tree
+            frames = ", ".join(sorted({*tree.edges, *tree.parents}))
+            what = f"tf has no chain from {name!r} to a fixed frame (its frames: {frames or 'none'})"
+            raise LogReadError(self._log.path, what, OTHER_POSES)
+        robot_chain = self._mounts.fixed_chain(robot)
+        if offset is not None:
+            return _TfLink(robot_chain, np.array([[offset.x, offset.y, offset.theta]]))
+        return _TfLink(robot_chain, None, (assumed_note(robot, name.lstrip("/")),), assumed=True)
+
+    def _tf_notes(self, chain: Sequence[str], stamps: Stamps) -> tuple[str, ...]:
+        """Return what a user should know of the transforms in a chain: gaps, and contradictions."""
+        tree = self._mounts.tree
+        notes: tuple[str, ...] = ()
         for frame in chain[:-1]:
             parent, series = tree.edges[frame]
             if not series.static:
-                notes += self._gap_note(f"tf from {parent} to {frame}", series.stamps, scans.stamps)
-        notes += tuple(f"{frame} has several parents in tf: {parent} is used" for frame, parent in tree.conflicts)
-        if self._has_offset:
-            notes += ("--laser-offset is not used: tf says where the laser is",)
-        return LaserPoses("tf", " > ".join(reversed(chain)), poses, valid, upside_down, notes)
+                notes += self._gap_note(f"tf from {parent} to {frame}", series.stamps, stamps)
+        return notes + tree.contradictions(chain)
 
     def _can_fuse(self) -> bool:
         """Return whether the log has a GPS or compass to fuse with, as far as ``auto`` is concerned."""
@@ -225,7 +296,7 @@ class PoseProvider:
             raise LogReadError(
                 self._log.path,
                 f"fused poses need odometry, or a GPS and a compass: there is {sensors.topics or 'none of them'}",
-                "give another --pose, or the topics by --odom-topic, --gps-topic and --compass-topic",
+                OTHER_POSES,
             )
         base = (sensors.odometry.base_frame if sensors.odometry else "") or BASE_FRAME
         nodes = self._nodes(scans, base, sensors)
@@ -234,7 +305,7 @@ class PoseProvider:
         stamps, first, last = scans.query_stamps, nodes.stamps[0], nodes.stamps[-1]
         at = np.searchsorted(nodes.stamps, np.clip(stamps, first, last))
         robot = estimate.poses[at]
-        mounts, upside_down, notes = self._mounts.laser_mounts(scans, base)
+        mounts, upside_down, notes, assumed = self._mounts.laser_mounts(scans, base)
         if sensors.odometry:
             notes += self._gap_note(sensors.odometry.topic, sensors.odometry.trajectory.stamps, scans.stamps)
         fused_sensors = tuple(_fused_sensors(sensors, estimate))
@@ -250,6 +321,7 @@ class PoseProvider:
             sensors=fused_sensors,
             fusion=fusion,
             mounts=mounts,
+            mount_assumed=assumed,
         )
 
     def _nodes(self, scans: ScanTimes, base: str, sensors: SensorLogs) -> FusionNodes:
@@ -268,7 +340,9 @@ class PoseProvider:
             )
         except ValueError:
             what = f"no scan lies within the time of {sensors.topics}"
-            raise LogReadError(self._log.path, what, "two clocks in one log? give another --pose") from None
+            raise LogReadError(
+                self._log.path, what, "two clocks in one log? by when messages were logged: --clock log"
+            ) from None
 
     def _gap_note(self, what: str, poses: Stamps, scans: Stamps) -> tuple[str, ...]:
         """Return a note where scans (stamps in ns) lie between poses that are far apart in time."""
@@ -319,6 +393,7 @@ def _split_end_poses(queried: LaserPoses, scans: int) -> LaserPoses:
         end_poses=np.where(known, queried.poses[scans:], poses),
         covariances=first(queried.covariances),
         mounts=first(queried.mounts),
+        upside_down=None if queried.upside_down is None else queried.upside_down[:scans],
     )
 
 

@@ -6,33 +6,26 @@ import math
 import re
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 
 import numpy as np
 
 from prim.arrays import FloatArray, Stamps
 from prim.errors import LogReadError
-from prim.log.messages import (
-    FIX_TYPE,
-    ODOMETRY_TYPE,
-    POINT_TYPE,
-    POSE_DECODERS,
-    POSE_TYPE,
-    POSE_WITH_COVARIANCE_TYPE,
-    TRUE_POSE_TOPIC,
-    VECTOR_TYPE,
-    StampedVector,
-    decode_fix,
-    decode_poses,
-    decode_vector,
-    planar_pose,
-)
+from prim.log.decoding.codecs import Content
+from prim.log.decoding.values import StampedVector, planar_pose
+from prim.log.messages import TRUE_POSE_TOPIC
 from prim.log.source import LogSource, Topic
 from prim.se2 import MAX_COORDINATE, Trajectory
 from replay.poses.transforms import is_valid_pose
 
-GPS_TYPES = (POINT_TYPE, FIX_TYPE)
-COMPASS_TYPES = (VECTOR_TYPE,)
+GPS_CONTENTS = (Content.POINT, Content.FIX)
+COMPASS_CONTENTS = (Content.VECTOR,)
+REST_HINT = "to map with the robot at rest give --standing-still"
+"""What helps where there are no poses."""
+
+POSE_CONTENTS = (Content.ODOMETRY, Content.POSE)
+"""What may be the robot's poses."""
+
 GPS_NAMES = ("gps", "gnss", "fix", "navsat")
 COMPASS_NAMES = ("compass", "north")
 """Points and vectors are those of a GPS and a compass where the topic has such a word in its name."""
@@ -152,20 +145,20 @@ def find_pose_topic(log: LogSource, requested: str | None = None) -> Topic | Non
     Raises:
         LogReadError: The requested topic has no poses, or several topics fit.
     """
-    poses = log.of_type(ODOMETRY_TYPE, POSE_TYPE, POSE_WITH_COVARIANCE_TYPE)
+    poses = log.holding(*POSE_CONTENTS)
     topics = [topic for topic in poses if topic.name != TRUE_POSE_TOPIC or topic.name == requested]
     names = ", ".join(f"{topic.name} ({topic.type})" for topic in topics) or "none"
     if requested is not None:
         chosen = [topic for topic in topics if topic.name == requested]
         if not chosen:
             there = log.topics.get(requested)
-            what = f"no {'messages' if there and there.type in POSE_DECODERS else 'poses'} on {requested}"
+            what = f"no {'messages' if there and there.content in POSE_CONTENTS else 'poses'} on {requested}"
             raise LogReadError(log.path, what, f"topics with poses: {names}")
         return chosen[0]
-    odometry = [topic for topic in topics if topic.type == ODOMETRY_TYPE] or topics
+    odometry = [topic for topic in topics if topic.content is Content.ODOMETRY] or topics
     if len(odometry) > 1:
         what = f"poses on {len(odometry)} topics: {', '.join(topic.name for topic in odometry)}"
-        raise LogReadError(log.path, what, "choose one with --odom-topic")
+        raise LogReadError(log.path, what, f"choose one with --odom-topic {odometry[0].name}")
     return odometry[0] if odometry else None
 
 
@@ -183,7 +176,7 @@ def find_odometry(log: LogSource, requested: str | None = None) -> Topic | None:
         LogReadError: The requested topic has no poses, or several topics fit.
     """
     topic = find_pose_topic(log, requested)
-    return topic if topic and (topic.type == ODOMETRY_TYPE or requested) else None
+    return topic if topic and (topic.content is Content.ODOMETRY or requested) else None
 
 
 def read_odometry(log: LogSource, topic: Topic) -> OdometryLog:
@@ -203,7 +196,7 @@ def read_odometry(log: LogSource, topic: Topic) -> OdometryLog:
     poses: list[tuple[float, float, float]] = []
     base_frame = ""
     skipped = 0
-    for _, messages in log.decoded(topic, partial(decode_poses, topic.type)):
+    for _, messages in log.decoded(topic):
         for message in messages:
             if is_valid_pose(message):
                 pose = planar_pose(message)
@@ -213,7 +206,7 @@ def read_odometry(log: LogSource, topic: Topic) -> OdometryLog:
             else:
                 skipped += 1
     if not stamps:
-        raise LogReadError(log.path, f"{topic.name} has no usable pose", "give another --pose")
+        raise LogReadError(log.path, f"{topic.name} has no usable pose", REST_HINT)
     return OdometryLog(topic.name, Trajectory.from_unsorted(stamps, poses), base_frame, skipped)
 
 
@@ -230,7 +223,7 @@ def find_gps(log: LogSource, requested: str | None = None) -> Topic | None:
     Raises:
         LogReadError: The requested topic is missing, or several topics fit.
     """
-    return _find(log, GPS_TYPES, GPS_NAMES, requested, "--gps-topic")
+    return _find(log, GPS_CONTENTS, GPS_NAMES, requested, "--gps-topic")
 
 
 def find_compass(log: LogSource, requested: str | None = None) -> Topic | None:
@@ -246,23 +239,27 @@ def find_compass(log: LogSource, requested: str | None = None) -> Topic | None:
     Raises:
         LogReadError: The requested topic is missing, or several topics fit.
     """
-    return _find(log, COMPASS_TYPES, COMPASS_NAMES, requested, "--compass-topic")
+    return _find(log, COMPASS_CONTENTS, COMPASS_NAMES, requested, "--compass-topic")
 
 
 def _find(
-    log: LogSource, types: Sequence[str], names: Iterable[str], requested: str | None, option: str
+    log: LogSource, contents: Sequence[Content], names: Iterable[str], requested: str | None, option: str
 ) -> Topic | None:
-    topics = log.of_type(*types)
+    topics = log.holding(*contents)
     if requested is not None:
         chosen = [topic for topic in topics if topic.name == requested]
         if not chosen:
             there = ", ".join(f"{topic.name} ({topic.type})" for topic in topics) or "none"
-            raise LogReadError(log.path, f"no {' or '.join(types)} on {requested}", f"topics of that type: {there}")
+            raise LogReadError(
+                log.path, f"no {' or '.join(contents)} on {requested}", f"topics with such messages: {there}"
+            )
         return chosen[0]
     likely = [topic for topic in topics if not set(names).isdisjoint(re.split(r"[/_]", topic.name.lower()))]
     if len(likely) > 1:
         listed = ", ".join(topic.name for topic in likely)
-        raise LogReadError(log.path, f"{len(likely)} topics to choose from: {listed}", f"choose one with {option}")
+        raise LogReadError(
+            log.path, f"{len(likely)} topics to choose from: {listed}", f"choose one with {option} {likely[0].name}"
+        )
     return likely[0] if likely else None
 
 
@@ -279,10 +276,8 @@ def read_gps(log: LogSource, topic: Topic) -> SensorReadings:
     Raises:
         LogReadError: A message is damaged.
     """
-    satellites = topic.type == FIX_TYPE
-    readings = _read(
-        log, topic, decode_fix if satellites else decode_vector, _is_on_earth if satellites else _is_near
-    )
+    satellites = topic.content is Content.FIX
+    readings = _read(log, topic, _is_on_earth if satellites else _is_near)
     if not satellites or not len(readings.stamps):
         return readings
     return replace(readings, values=geodetic_to_plane(readings.values))
@@ -311,17 +306,15 @@ def read_compass(log: LogSource, topic: Topic) -> SensorReadings:
     Raises:
         LogReadError: A message is damaged.
     """
-    return _read(log, topic, decode_vector, lambda north: 1e-9 < math.hypot(north.x, north.y, north.z) < 1e100)
+    return _read(log, topic, lambda north: 1e-9 < math.hypot(north.x, north.y, north.z) < 1e100)
 
 
-def _read(
-    log: LogSource, topic: Topic, decode: Callable[[bytes], StampedVector], accepts: Callable[[StampedVector], bool]
-) -> SensorReadings:
+def _read(log: LogSource, topic: Topic, accepts: Callable[[StampedVector], bool]) -> SensorReadings:
     """Read the usable values of a topic by rising stamp; of those with the same stamp the last remains."""
     values: dict[int, tuple[float, float, float]] = {}
     frame_id = ""
     skipped = 0
-    for _, message in log.decoded(topic, decode):
+    for _, message in log.decoded(topic):
         if accepts(message):
             values[message.stamp] = message.x, message.y, message.z
             frame_id = message.frame_id.lstrip("/")

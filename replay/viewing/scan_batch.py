@@ -23,12 +23,14 @@ class ScanEntry(NamedTuple):
         stamp: Its stamp (ns).
         pose: The laser's pose.
         points: End points (M, 2) in the map frame (m).
+        scanner: Which of the scanners took it, from 0.
     """
 
     position: int
     stamp: int
     pose: Pose2D
     points: FloatArray
+    scanner: int = 0
 
 
 class ScanBatch:

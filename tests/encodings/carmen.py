@@ -15,7 +15,9 @@ from pathlib import Path
 
 import numpy as np
 
-from prim.log.cdr import SECOND
+from prim.log.decoding.cdr import SECOND
+from prim.log.decoding.ros import decode_scan
+from prim.log.decoding.values import planar_pose
 from prim.log.messages import (
     ODOM_TOPIC,
     ODOMETRY_TYPE,
@@ -23,16 +25,13 @@ from prim.log.messages import (
     SCAN_TYPE,
     TF_STATIC_TOPIC,
     TF_TYPE,
-    decode_poses,
-    decode_scan,
     encode_odometry,
     encode_scan,
-    planar_pose,
 )
 from prim.log.source import Message
 from prim.scan import Scan
 from prim.se2 import Pose2D
-from tests.encodings.content import LogContent, mapped
+from tests.encodings.content import LogContent, decode_poses, mapped
 
 ROS_TYPES = {TF_STATIC_TOPIC: TF_TYPE, ODOM_TOPIC: ODOMETRY_TYPE, SCAN_TOPIC: SCAN_TYPE}
 """The topics that are written; the fixed transform to the laser becomes the poses of the lines of scans."""

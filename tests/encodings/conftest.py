@@ -2,7 +2,8 @@ import math
 
 import pytest
 
-from prim.log.messages import SCAN_TOPIC, decode_scan, encode_scan
+from prim.log.decoding.ros import decode_scan
+from prim.log.messages import SCAN_TOPIC, encode_scan
 from recorder.sensors import Lidar
 from recorder.session import SessionOptions, record_session
 from tests.encodings.content import LogContent, delayed, read_content

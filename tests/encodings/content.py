@@ -7,6 +7,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from prim.log import open_log
+from prim.log.decoding.codecs import codec_of
+from prim.log.decoding.values import StampedPose
 from prim.log.messages import (
     BASE_FRAME,
     LASER_FRAME,
@@ -111,3 +113,11 @@ def parts(content: LogContent, count: int) -> list[LogContent]:
 def _without(content: LogContent, *topics: str) -> LogContent:
     types = {topic: kind for topic, kind in content.types.items() if topic not in topics}
     return replace(content, types=types, messages=tuple(m for m in content.messages if m.topic in types))
+
+
+def decode_poses(type_name: str, data: bytes) -> list[StampedPose]:
+    """Decode the poses of a message in CDR."""
+    codec = codec_of(type_name, "cdr")
+    assert codec is not None
+    poses: list[StampedPose] = codec.decode(data)
+    return poses

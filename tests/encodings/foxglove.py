@@ -21,21 +21,13 @@ from google.protobuf.descriptor import FileDescriptor
 from google.protobuf.descriptor_pb2 import FileDescriptorSet
 from mcap.writer import Writer
 
-from prim.log.cdr import SECOND
-from prim.log.messages import (
-    SCAN_TOPIC,
-    SCAN_TYPE,
-    TF_STATIC_TOPIC,
-    TF_TOPIC,
-    TF_TYPE,
-    StampedPose,
-    decode_poses,
-    decode_scan,
-    encode_scan,
-)
+from prim.log.decoding.cdr import SECOND
+from prim.log.decoding.ros import decode_scan
+from prim.log.decoding.values import StampedPose
+from prim.log.messages import SCAN_TOPIC, SCAN_TYPE, TF_STATIC_TOPIC, TF_TOPIC, TF_TYPE, encode_scan
 from prim.log.source import Message
 from prim.scan import Scan
-from tests.encodings.content import LogContent, mapped
+from tests.encodings.content import LogContent, decode_poses, mapped
 from tests.encodings.ros2 import CHUNK_BYTES
 
 ROS_TYPES = {SCAN_TOPIC: SCAN_TYPE, TF_TOPIC: TF_TYPE, TF_STATIC_TOPIC: TF_TYPE}

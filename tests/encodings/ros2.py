@@ -16,7 +16,7 @@ from rosbags.typesys import Stores, get_typestore
 from ruamel.yaml import YAML
 
 from prim.log.messages import message_definition
-from tests.encodings.content import LATCHED, LogContent, parts
+from tests.encodings.content import LATCHED, LogContent, parts, without_records
 
 CHUNK_BYTES = 16 * 1024
 """So small that a short log has several chunks."""
@@ -224,7 +224,7 @@ def _write_split(content: LogContent, folder: Path, storage: str, count: int, zs
     bag.mkdir()
     suffix = ".mcap" if storage == "mcap" else ".db3"
     names = []
-    for number, part in enumerate(parts(content, count)):
+    for number, part in enumerate(parts(without_records(content), count)):
         path = (write_mcap if storage == "mcap" else write_db3_foxy)(part, folder)
         names.append(f"bag_{number}{suffix}{zstd}")
         data = path.read_bytes()

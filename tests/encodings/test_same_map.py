@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 
 import prim
-from prim.errors import LogReadError
-from prim.log.messages import SCAN_TOPIC, decode_scan
+from prim.log.decoding.ros import decode_scan
+from prim.log.messages import SCAN_TOPIC
 from prim.scan import RangeOutcome
 from tests.encodings import ros2
 from tests.encodings.content import LogContent, without_truth
@@ -21,20 +21,6 @@ from tests.encodings.table import ENCODINGS, Encoding, Reduction, everything
 OPTIONS: dict[str, Any] = {"mapper": "forward", "resolution": 0.02}
 
 Replay = Callable[[Reduction, bool], prim.Result]
-
-TO_COME = {
-    encoding.name
-    for encoding in ENCODINGS
-    if not encoding.name.startswith("mcap") or encoding.name not in
-    {"mcap", "mcap-lz4", "mcap-uncompressed", "mcap-unchunked", "mcap-unindexed", "mcap-unindexed-unchunked",
-     "mcap-unsorted", "mcap-folder"}
-}  # fmt: skip
-"""The encodings that have no reader yet: take a name out when its reader is there, and this set when all are."""
-
-
-def marked(encoding: Encoding) -> Any:
-    waits = pytest.mark.xfail(raises=LogReadError, reason="there is no reader yet", strict=False)
-    return pytest.param(encoding, id=encoding.name, marks=[waits] if encoding.name in TO_COME else [])
 
 
 @pytest.fixture(scope="module")
@@ -50,7 +36,7 @@ def reduced(content: LogContent, tmp_path_factory: pytest.TempPathFactory) -> Re
 
 
 @pytest.mark.parametrize("truth", [True, False], ids=["truth", "no-truth"])
-@pytest.mark.parametrize("encoding", map(marked, ENCODINGS))
+@pytest.mark.parametrize("encoding", ENCODINGS, ids=lambda encoding: encoding.name)
 def test_one_session_in_every_encoding_gives_the_same(
     content: LogContent, reduced: Replay, tmp_path: Path, encoding: Encoding, truth: bool
 ) -> None:

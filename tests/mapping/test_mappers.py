@@ -232,14 +232,14 @@ def test_unknown_mappers_and_too_large_grids_are_refused() -> None:
 def map_of(session: Session, name: str, scans: int | None = None) -> tuple[OccupancyGrid, ReferenceMap]:
     """Return a session's map at the session's own poses, and its reference map."""
     from prim.log import open_log
-    from replay.posed_scans import ScanLog
     from replay.poses.pose_provider import PoseProvider
-    from replay.selection import Selection
+    from replay.scans.scan_log import ScanLog
+    from replay.scans.selection import Selection
 
     mapper = make_mapper(name, 0.01, (-1.1, -1.1, 1.1, 1.1))
     truth = ReferenceMap(mapper.grid().frame)
     with open_log(session.path) as log:
-        scan_log = ScanLog(log, None, Selection(n_scans=scans))
+        scan_log = ScanLog(log, Selection(n_scans=scans))
         poses = PoseProvider(log).laser_poses(scan_log.times, "truth")
         for position, scan in scan_log:
             pose = Pose2D(*poses.poses[position].tolist())

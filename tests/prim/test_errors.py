@@ -13,7 +13,7 @@ from prim.errors import InterruptedRunError, LogReadError, OutputError, PrimErro
         LogReadError("a.mcap", "is empty", "record another one"),
         OutputError("a.json", OSError(28, "No space left on device")),
         InterruptedRunError("interrupted", 143),
-        MapSizeError("a map of 1e9 cells"),
+        MapSizeError("a map of 1e9 cells", 0.01, 5.0),
     ],
 )
 def test_errors_come_out_of_worker_processes_as_they_are(error: PrimError) -> None:

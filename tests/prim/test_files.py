@@ -204,4 +204,5 @@ def test_nothing_else_writes_files() -> None:
         "prim/files.py",
         "prim/console.py",  # /dev/null in the place of a closed stream
         "prim/log/writer.py",  # the part of an OutputFile
+        "prim/log/log_file.py",  # a temporary file
     }

@@ -14,16 +14,11 @@ import pytest
 import shapely
 
 from prim.log import open_log
+from prim.log.decoding.values import planar_pose
 from prim.log.messages import (
-    ODOMETRY_TYPE,
-    POSE_TYPE,
     SCAN_TOPIC,
     TRUE_POSE_TOPIC,
     TRUE_PRIMITIVES_TOPIC,
-    decode_poses,
-    decode_primitives,
-    decode_scan,
-    planar_pose,
 )
 from prim.se2 import Pose2D, Trajectory
 from prim.shapes import Kind, Primitive
@@ -45,15 +40,15 @@ def driven(tmp_path_factory: pytest.TempPathFactory) -> Session:
     return record_session(path, SessionOptions(seed=10, motion="drive", lidar=Lidar(rays=180, noise_std=0.02)))
 
 
-def trajectory(path: Path, topic: str, kind: str) -> Trajectory:
+def trajectory(path: Path, topic: str) -> Trajectory:
     with open_log(path) as log:
-        found = [pose for _, (pose,) in log.decoded(log.topics[topic], lambda data: decode_poses(kind, data))]
+        found = [pose for _, (pose,) in log.decoded(log.topics[topic])]
     poses = [(p.x, p.y, p.theta) for p in map(planar_pose, found)]
     return Trajectory.from_unsorted([pose.stamp for pose in found], poses)
 
 
 def test_the_robot_explores_and_keeps_clear_of_obstacles(driven: Session) -> None:
-    true = trajectory(driven.path, TRUE_POSE_TOPIC, POSE_TYPE)
+    true = trajectory(driven.path, TRUE_POSE_TOPIC)
     assert len(true) == driven.scans == 600
     outlines = shapely.union_all([shapely.Polygon(primitive.outline()) for primitive in driven.world.primitives])
     points = shapely.points(true.poses[:, :2])
@@ -86,10 +81,7 @@ def test_odometry_without_noise_is_the_truth(tmp_path: Path) -> None:
         tmp_path / "a.mcap",
         SessionOptions(seed=2, motion="drive", duration=10, odometry=still, lidar=Lidar(rays=8)),
     )
-    true, estimated = (
-        trajectory(session.path, topic, kind)
-        for topic, kind in ((TRUE_POSE_TOPIC, POSE_TYPE), ("/odom", ODOMETRY_TYPE))
-    )
+    true, estimated = (trajectory(session.path, topic) for topic in (TRUE_POSE_TOPIC, "/odom"))
     assert estimated.poses == pytest.approx(true.poses, abs=1e-9)
 
 
@@ -117,8 +109,8 @@ def test_pushed_primitives_move_and_are_logged(tmp_path: Path) -> None:
     )
     with open_log(session.path) as log:
         topic = log.topics[TRUE_PRIMITIVES_TOPIC]
-        logged = [primitives for _, (_, primitives) in log.decoded(topic, decode_primitives)]
-        scans = [scan for _, scan in log.decoded(log.topics[SCAN_TOPIC], decode_scan)]
+        logged = [primitives for _, (_, primitives) in log.decoded(topic)]
+        scans = [scan for _, scan in log.decoded(log.topics[SCAN_TOPIC])]
     first, last = logged[0], logged[-1]
     moved = [math.hypot(a.x - b.x, a.y - b.y) for a, b in zip(first, last, strict=True)]
     assert len(logged) > 10
@@ -188,7 +180,7 @@ def killed_recording(folder: Path, seconds: float, seed: int) -> tuple[Path, flo
 def check_killed(part: Path, killed: float, seconds: float) -> None:
     """Every chunk is read, and the last one was written in the second before the end."""
     with open_log(part, recover=True) as log:
-        scans = [scan for _, scan in log.decoded(log.topics[SCAN_TOPIC], decode_scan)] if log.topics else []
+        scans = [scan for _, scan in log.decoded(log.topics[SCAN_TOPIC])] if log.topics else []
         assert len(log.lost) == 1
     if seconds > 1:
         assert killed - part.stat().st_mtime < 1

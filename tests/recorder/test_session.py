@@ -13,15 +13,8 @@ from rosbags.typesys import Stores, get_typestore
 from prim import console
 from prim.errors import UsageError, WorldError
 from prim.log import open_log
-from prim.log.messages import (
-    GPS_TOPIC,
-    POSE_TYPE,
-    SCAN_TOPIC,
-    TRUE_POSE_TOPIC,
-    decode_poses,
-    decode_scan,
-    planar_pose,
-)
+from prim.log.decoding.values import planar_pose
+from prim.log.messages import GPS_TOPIC, SCAN_TOPIC, TRUE_POSE_TOPIC
 from prim.scan import Scan
 from prim.se2 import Pose2D
 from prim.shapes import Kind, Primitive
@@ -74,11 +67,8 @@ def test_more_noise_changes_neither_world_nor_poses(tmp_path: Path) -> None:
             tmp_path / "a.mcap", SessionOptions(seed=4, stops=(3, 3), lidar=Lidar(noise_std=noise))
         )
         with open_log(session.path) as log:
-            poses = [
-                planar_pose(p)
-                for _, (p,) in log.decoded(log.topics[TRUE_POSE_TOPIC], lambda d: decode_poses(POSE_TYPE, d))
-            ]
-            ranges = np.array([scan.ranges for _, scan in log.decoded(log.topics[SCAN_TOPIC], decode_scan)])
+            poses = [planar_pose(p) for _, (p,) in log.decoded(log.topics[TRUE_POSE_TOPIC])]
+            ranges = np.array([scan.ranges for _, scan in log.decoded(log.topics[SCAN_TOPIC])])
         return session.world, poses, ranges
 
     quiet, loud = recorded(0.0), recorded(0.1)
@@ -133,7 +123,7 @@ def test_the_robot_keeps_clear_of_everything(quiet_session: Session) -> None:
     outlines = [shapely.Polygon(primitive.outline()) for primitive in quiet_session.world.primitives]
     with open_log(quiet_session.path) as log:
         topic = log.topics[TRUE_POSE_TOPIC]
-        poses = [planar_pose(pose) for _, (pose,) in log.decoded(topic, lambda d: decode_poses(POSE_TYPE, d))]
+        poses = [planar_pose(pose) for _, (pose,) in log.decoded(topic)]
     assert len(poses) == quiet_session.scans
     assert len(poses) + quiet_session.skipped == 100
     stops = {(round(10 * pose.x + 9.5) / 2, round(10 * pose.y + 9.5) / 2) for pose in poses}
@@ -153,9 +143,9 @@ def test_stops_inside_a_primitive_or_touching_it_are_skipped() -> None:
 
 def test_exact_ranges_are_those_of_the_world(quiet_session: Session) -> None:
     with open_log(quiet_session.path) as log:
-        _, scan = next(log.decoded(log.topics[SCAN_TOPIC], decode_scan))
+        _, scan = next(log.decoded(log.topics[SCAN_TOPIC]))
         topic = log.topics[TRUE_POSE_TOPIC]
-        _, (stamped,) = next(log.decoded(topic, lambda d: decode_poses(POSE_TYPE, d)))
+        _, (stamped,) = next(log.decoded(topic))
     pose = planar_pose(stamped)
     bearings = np.linspace(-3.14, 3.14, 500) + pose.theta
     exact = quiet_session.world.cast((pose.x, pose.y), np.column_stack((np.cos(bearings), np.sin(bearings))))
@@ -243,7 +233,7 @@ def test_command_line_options_reach_the_log(tmp_path: Path, capsys: pytest.Captu
     assert code == 0
     assert "noise 250 mm, 2 circles, 2 ellipses" in capsys.readouterr().out
     with open_log(path) as log:
-        scans = [scan for _, scan in log.decoded(log.topics[SCAN_TOPIC], decode_scan)]
+        scans = [scan for _, scan in log.decoded(log.topics[SCAN_TOPIC])]
         described = log.metadata["prim"]
         world = World.from_json(json.loads(log.attachment("world.json") or b""))
     assert (world.size, world.walls) == ((3, 4), ())

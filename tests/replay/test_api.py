@@ -329,7 +329,7 @@ def test_the_options_of_the_command_line_are_keywords() -> None:
     """All but those that say where outputs go, and what is printed."""
     outputs = {"logs", "save", "spawn", "connect", "serve", "no_viewer", "report", "map_output", "trajectory"}
     outputs |= {"context", "serve_host", "force"}
-    printed = {"quiet", "verbose", "debug", "version"}
+    printed = {"quiet", "verbose", "debug", "version", "list_topics", "as_json"}
     options = set(inspect.signature(cli.replay).parameters) - outputs - printed
     assert {name.removeprefix("no_") for name in options} == set(ReplayKeywords.__annotations__)
 

@@ -54,6 +54,7 @@ def test_a_replay_writes_a_recording_and_a_report_by_default(
     assert report["schema"] == "prim-replay/1"
     assert report["log"] == {
         "path": str(noisy_session.path),
+        "format": "MCAP",
         "duration_s": pytest.approx(noisy_session.duration),
         "scans": noisy_session.scans,
         "scans_used": noisy_session.scans,
@@ -570,4 +571,4 @@ def test_missing_sensors_are_reported(replay: Run, driven_session: Path) -> None
     code, _, err = replay(driven_session, "--pose", "fused", "--fuse", "gps")
     assert code == 1 and "fused poses need odometry, or a GPS and a compass: there is /gps" in err
     code, _, err = replay(driven_session, "--pose", "fused", "--gps-topic", "/odom")
-    assert code == 1 and "topics of that type: /gps" in err
+    assert code == 1 and "topics with such messages: /gps" in err

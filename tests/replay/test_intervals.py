@@ -54,7 +54,7 @@ def test_what_is_asked_for_is_done(is_shown: bool) -> None:
 
 def test_large_maps_are_said_to_be_searched_seldom() -> None:
     looks = detection_interval(ReplayOptions(), 700, DETECTED_CELLS // 3, is_shown=True)
-    assert looks.scans == 234 and "3 times along the way: more often with --detect-every N" in looks.note
+    assert looks.scans == 234 and "3 times along the way: more often with --detect-every 117" in looks.note
     looks = detection_interval(ReplayOptions(), 700, DETECTED_CELLS + 1, is_shown=True)
     assert looks.scans is None and "at the end only" in looks.note
     single = detection_interval(ReplayOptions(), 700, DETECTED_CELLS, is_shown=True)

@@ -197,7 +197,7 @@ def test_logs_of_other_writers_are_read(replay: Replay, options: dict[str, Any])
         assert (code, err, report["log"]["scans_used"]) == (0, "", 3)
 
 
-@pytest.mark.parametrize("encoding", ["json", "ros1", "protobuf"])
+@pytest.mark.parametrize("encoding", ["json", "cbor", "protobuf"])
 def test_other_encodings_are_named(replay: Replay, encoding: str) -> None:
     with Path("a.mcap").open("wb") as stream:
         writer = Writer(stream)

@@ -30,7 +30,7 @@ from recorder.session import Session
 from replay.options import ReplayOptions
 from replay.pipeline import Pipeline
 from replay.result import ReplayResult
-from replay.selection import Selection
+from replay.scans.selection import Selection
 from replay.timing import StageTimer
 from replay.viewing.protocol import NullViewer
 from tests.replay.poses.test_pose_provider import raw_transform

@@ -14,9 +14,9 @@ from prim.scan import PosedScan, Scan
 from prim.se2 import Pose2D
 from recorder.session import Session
 from replay.detection.refiner import ScanSubset
-from replay.posed_scans import PosedScanOptions, PosedScans, ScanLog
 from replay.poses.pose_provider import PoseProvider
-from replay.selection import Selection
+from replay.scans.posed_scans import PosedScanOptions, PosedScans, ScanLog
+from replay.scans.selection import Selection
 from replay.timing import MAX_WAIT, RatePacer, StageTimer
 
 
@@ -25,7 +25,7 @@ def posed_scans(
 ) -> list[PosedScan]:
     """Read a session's scans; those before ``first_valid`` have no pose."""
     with open_log(session.path) as log:
-        scans = ScanLog(log, None, Selection())
+        scans = ScanLog(log, Selection())
         poses = PoseProvider(log).laser_poses(scans.times, "truth")
         poses = replace(poses, valid=np.arange(len(scans)) >= first_valid)
         posed = PosedScans(scans, poses, options or PosedScanOptions(), timer)

@@ -131,7 +131,7 @@ def test_a_scanner_that_stands_still_is_mapped(real_log: Find, in_tmp: Path, map
     assert report["pose"]["source"] == "still" and report["pose"]["rmse_m"] is None
     assert report["log"]["scans_used"] == report["log"]["scans"] == 331
     assert report["map"]["scores"] is None
-    options = ReplayOptions(mapper=mapper, scan_topic="/front_scan", standing_still=True)
+    options = ReplayOptions(mapper=mapper, scan_topic=("/front_scan",), standing_still=True)
     grid = Pipeline(path, options).run().grid
     assert np.count_nonzero(grid.occupied) > 200
     assert np.count_nonzero(grid.free) > 10_000

@@ -15,13 +15,13 @@ import rerun as rr
 from mapping.grid import OccupancyGrid
 from prim.errors import OutputError, UsageError
 from prim.log import open_log
-from prim.log.messages import SCAN_TOPIC, decode_scan
+from prim.log.messages import SCAN_TOPIC
 from prim.se2 import Pose2D
 from recorder.session import Session
 from replay.options import ReplayOptions
 from replay.pipeline import Pipeline
 from replay.result import ReplayResult
-from replay.selection import Selection
+from replay.scans.selection import Selection
 from replay.viewer import RecordingError, RerunViewer
 from replay.viewing.protocol import ViewerOptions
 from replay.viewing.serving import RecordingServer
@@ -156,7 +156,7 @@ def test_the_recording_has_exactly_two_timelines(recording: tuple[Path, ReplayRe
 def test_scans_are_drawn_at_their_end_points(recording: tuple[Path, ReplayResult], noisy_session: Session) -> None:
     path, result = recording
     with open_log(noisy_session.path) as log:
-        scans = [scan for _, scan in log.decoded(log.topics[SCAN_TOPIC], decode_scan)]
+        scans = [scan for _, scan in log.decoded(log.topics[SCAN_TOPIC])]
     for row in timed(rows_of(path)["/map/scan"])[::7]:
         points = np.array(value(row, "positions"))[:, :2]
         pose = Pose2D(*result.poses.poses[row["scan"]])

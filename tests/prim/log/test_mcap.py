@@ -9,7 +9,7 @@ from rosbags.typesys import Stores, get_typestore
 
 from prim.errors import InterruptedRunError, LogReadError, OutputError
 from prim.log import open_log
-from prim.log.messages import SCAN_TOPIC, SCAN_TYPE, decode_scan, encode_scan
+from prim.log.messages import SCAN_TOPIC, SCAN_TYPE, encode_scan
 from prim.log.source import LogSource
 from prim.log.writer import LogWriter
 from prim.scan import Scan
@@ -34,7 +34,7 @@ def write_log(path: Path, scans: int = 300, beams: int = 500) -> list[Scan]:
 def read_scans(path: Path, recover: bool = False) -> tuple[list[Scan], LogSource]:
     with open_log(path, recover=recover) as log:
         topic = log.topics[SCAN_TOPIC]
-        return [scan for _, scan in log.decoded(topic, decode_scan)], log
+        return [scan for _, scan in log.decoded(topic)], log
 
 
 def test_what_is_written_is_read(tmp_path: Path) -> None:
@@ -151,9 +151,9 @@ def test_an_interrupted_recording_keeps_what_was_written(tmp_path: Path) -> None
     [
         (b"", "an empty file"),
         (b"\x89PNG\r\n\x1a\n" + b"\0" * 99, "a PNG image"),
-        (b"#ROSBAG V2.0\n" + b"\0" * 99, "a ROS 1 bag.*rosbags-convert"),
-        (b"SQLite format 3\0" + b"\0" * 99, "SQLite.*rosbags-convert"),
-        (b"hello", "not an MCAP log"),
+        (b"#ROSBAG V2.0\n" + b"\0" * 99, "damaged"),
+        (b"SQLite format 3\0" + b"\0" * 99, "damaged"),
+        (b"hello", "not a log of a known format"),
         (b"\x89MCAP0\r\n", "truncated"),
         (b"\x89MCAP0\r\n" * 9, "truncated"),
     ],
@@ -168,12 +168,12 @@ def test_other_files_are_refused_by_what_they_are(tmp_path: Path, content: bytes
 
 
 def test_a_folder_is_read_where_it_holds_one_log(tmp_path: Path) -> None:
-    with pytest.raises(LogReadError, match=r"without an \.mcap log"):
+    with pytest.raises(LogReadError, match="without a log"):
         open_log(tmp_path)
     write_log(tmp_path / "bag_0.mcap", scans=3)
     assert len(read_scans(tmp_path)[0]) == 3
-    write_log(tmp_path / "bag_1.mcap", scans=3)
-    with pytest.raises(LogReadError, match=r"bag_0\.mcap, bag_1\.mcap"):
+    write_log(tmp_path / "other.mcap", scans=3)
+    with pytest.raises(LogReadError, match=r"bag_0\.mcap, other\.mcap"):
         open_log(tmp_path)
 
 

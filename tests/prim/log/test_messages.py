@@ -1,5 +1,6 @@
 import math
 import struct
+from typing import Any
 
 import numpy as np
 import pytest
@@ -8,22 +9,21 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from rosbags.typesys import Stores, get_typestore
 
+from prim.log.decoding.codecs import codec_of
+from prim.log.decoding.ros import decode_scan
+from prim.log.decoding.values import planar_pose
 from prim.log.messages import (
+    MARKERS_TYPE,
     ODOMETRY_TYPE,
     POSE_TYPE,
     SCAN_TYPE,
     TF_TYPE,
-    decode_poses,
-    decode_primitives,
-    decode_scan,
-    decode_stamp,
     encode_compass,
     encode_odometry,
     encode_pose,
     encode_primitives,
     encode_scan,
     encode_transforms,
-    planar_pose,
 )
 from prim.scan import Scan
 from prim.se2 import Pose2D
@@ -44,6 +44,18 @@ SCANS = st.builds(
     time_increment=FLOATS,
     scan_time=FLOATS,
 )
+
+
+def decode(type_name: str, data: bytes) -> Any:
+    codec = codec_of(type_name, "cdr")
+    assert codec is not None
+    return codec.decode(data)
+
+
+def decode_stamp(data: bytes, type_name: str = SCAN_TYPE) -> int:
+    codec = codec_of(type_name, "cdr")
+    assert codec is not None
+    return codec.stamp(data)
 
 
 def same(a: Scan, b: Scan) -> bool:
@@ -94,7 +106,7 @@ def test_poses_round_trip(theta: float) -> None:
         (POSE_TYPE, encode_pose(stamp, pose)),
         (TF_TYPE, encode_transforms([(stamp, "odom", "base_link", pose)])),
     ):
-        (stamped,) = decode_poses(type_name, data)
+        (stamped,) = decode(type_name, data)
         seen = planar_pose(stamped)
         assert stamped.stamp == stamp
         assert (seen.x, seen.y) == (1.5, -2.5)
@@ -121,7 +133,7 @@ def test_primitives_round_trip() -> None:
         Primitive(Kind.TRIANGLE, -0.1, 0.2, 5.0, (0.1, 0.2)),
         Primitive(Kind.ELLIPSE, -0.5, 0.2, 2.0, (0.2, 0.1)),
     )
-    stamp, primitives = decode_primitives(encode_primitives(7, World((2, 2), shapes).with_walls()))
+    stamp, primitives = decode(MARKERS_TYPE, encode_primitives(7, World((2, 2), shapes).with_walls()))
     assert stamp == 7
     for primitive, shape in zip(primitives, shapes, strict=True):
         assert primitive.kind is shape.kind
@@ -133,6 +145,6 @@ def test_primitives_round_trip() -> None:
     "data", [b"", b"\x00", b"\x00\x01\x00\x00", b"\xff" * 40, b"\x00\x01\x00\x00" + b"\xff" * 40]
 )
 def test_other_bytes_are_refused(data: bytes) -> None:
-    for decode in (decode_scan, decode_primitives, lambda d: decode_poses(TF_TYPE, d)):
+    for type_name in (SCAN_TYPE, MARKERS_TYPE, TF_TYPE):
         with pytest.raises(ValueError, match=r"not|CDR|claims|ends at byte"):
-            decode(data)
+            decode(type_name, data)

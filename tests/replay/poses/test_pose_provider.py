@@ -31,7 +31,7 @@ from replay.poses.transforms import TransformTree
 
 SECOND = 10**9
 STAMPS = np.array([SECOND, SECOND + SECOND // 2, 2 * SECOND])
-TIMES = ScanTimes(STAMPS, "laser")
+TIMES = ScanTimes(STAMPS, ("laser",))
 
 Write = Callable[[LogWriter], None]
 
@@ -205,7 +205,7 @@ def test_laser_mounted_upside_down_is_detected(tmp_path: Path) -> None:
     with log_of(tmp_path / "a.mcap", rolled, transforms("/tf", *MOVING), DRIVE) as log:
         for source in ("tf", "odom"):
             located = PoseProvider(log).laser_poses(TIMES, source)
-            assert located.upside_down
+            assert located.is_upside_down(1)
             assert located.poses[1] == pytest.approx((1, 0, math.pi / 4))
 
 

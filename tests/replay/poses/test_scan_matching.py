@@ -22,12 +22,13 @@ from recorder.sensors import Lidar
 from recorder.session import SessionOptions, record_session
 from replay.options import ReplayOptions
 from replay.pipeline import Pipeline
-from replay.posed_scans import PosedScans, ScanLog
 from replay.poses.fusion_options import SensorNoise
 from replay.poses.laser_poses import FUSED, LaserPoses
 from replay.poses.pose_provider import PoseProvider
 from replay.poses.scan_matching import match_scans
-from replay.selection import Selection
+from replay.scans.posed_scans import PosedScans
+from replay.scans.scan_log import ScanLog
+from replay.scans.selection import Selection
 
 ROOM = World(
     (2.0, 2.0),
@@ -113,7 +114,7 @@ def driven(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.mark.parametrize(("source", "share"), [("odom", 1 / 3), (FUSED, 0.8)])
 def test_matched_poses_are_more_accurate(driven: Path, source: str, share: float) -> None:
     with open_log(driven) as log:
-        scans = ScanLog(log, None, Selection())
+        scans = ScanLog(log, Selection())
         truth = PoseProvider(log).laser_poses(scans.times, "truth").poses
         poses = PoseProvider(log).laser_poses(scans.times, source)
         matched = match_scans(poses, scans.stamps, partial(PosedScans, scans), 0.02)
@@ -125,7 +126,7 @@ def test_matched_poses_are_more_accurate(driven: Path, source: str, share: float
 
 def test_matching_reduces_the_noise_of_poses_that_do_not_drift(driven: Path) -> None:
     with open_log(driven) as log:
-        scans = ScanLog(log, None, Selection())
+        scans = ScanLog(log, Selection())
         truth = PoseProvider(log).laser_poses(scans.times, "truth")
         rng = np.random.default_rng(1)
         noise = np.column_stack((rng.normal(0, 0.1, (len(truth.poses), 2)), rng.normal(0, 0.03, len(truth.poses))))
@@ -217,8 +218,8 @@ def test_replay_deskews_scans_unless_disabled(tmp_path: Path, mapper: str) -> No
 
 def test_end_poses_follow_corrected_poses(driven: Path) -> None:
     with open_log(driven) as log:
-        scans = ScanLog(log, None, Selection(n_scans=20))
-        times = replace(scans.times, sweep=10**8)
+        scans = ScanLog(log, Selection(n_scans=20))
+        times = replace(scans.times, sweeps=(10**8,))
         poses = PoseProvider(log).laser_poses(times, "odom")
         assert poses.end_poses is not None
 

@@ -8,7 +8,6 @@ import pytest
 
 from prim.errors import LogReadError
 from prim.log.messages import (
-    FIX_TYPE,
     POINT_TYPE,
     POSE_TYPE,
     VECTOR_TYPE,
@@ -40,6 +39,8 @@ DRIVE_X = [(1.0, 0.0), (1.5, 1.0), (2.0, 2.0)]
 """Seconds and x of a robot that drives along x."""
 
 STRAIGHT = odometry("/odom", *((t, Pose2D(x, 0, 0)) for t, x in DRIVE_X))
+
+FIX_TYPE = "sensor_msgs/msg/NavSatFix"
 
 
 def points(topic: str, *fixes: tuple[float, float, float], frame: str = "map") -> Write:
@@ -148,7 +149,7 @@ def test_several_gps_topics_are_listed(tmp_path: Path) -> None:
     with log_of(tmp_path / "a.mcap", GPS, points("/gps_rear", (1.0, 0, 0))) as log:
         with pytest.raises(LogReadError, match=r"2 topics to choose from: .*choose one with --gps-topic"):
             find_gps(log)
-        with pytest.raises(LogReadError, match=r"on /nothing.*topics of that type: /gps"):
+        with pytest.raises(LogReadError, match=r"on /nothing.*topics with such messages: /gps"):
             find_gps(log, "/nothing")
 
 

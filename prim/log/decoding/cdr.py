@@ -44,13 +44,17 @@ class CdrReader:
         Returns:
             The values.
         """
-        at = self._at + (4 - self._at) % size
+        at = self._aligned(size)
         try:
             values = struct.unpack_from(self._order + form, self._data, at)
         except struct.error:
             raise CdrError(f"it ends at byte {len(self._data)}, within its fields at byte {at}") from None
         self._at = at + size * len(values)
         return values
+
+    def _aligned(self, size: int) -> int:
+        """Return where the next field of ``size`` bytes begins."""
+        return self._at + (4 - self._at) % size
 
     def length(self, item_size: int) -> int:
         """Read the length of a string or sequence of items of ``item_size`` bytes; it must fit into the message."""
@@ -83,12 +87,22 @@ class CdrReader:
         """
         count = self.length(item_size)
         if count:
-            self._at += (4 - self._at) % alignment + count * item_size
+            self._at = self._aligned(alignment) + count * item_size
+
+    def octets(self) -> bytes:
+        """Read a sequence of bytes."""
+        count = self.length(1)
+        start, self._at = self._at, self._at + count
+        return self._data[start : start + count]
 
     def stamp(self) -> int:
         """Read a builtin_interfaces/Time (ns)."""
         seconds, nanoseconds = self.unpack("iI", 4)
         return int(seconds) * SECOND + int(nanoseconds)
+
+    def header_stamp(self) -> int:
+        """Read the stamp (ns) of a std_msgs/Header, and nothing behind it."""
+        return self.stamp()
 
     def header(self) -> tuple[int, str]:
         """Read a std_msgs/Header: stamp (ns) and frame."""

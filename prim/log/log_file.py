@@ -1,0 +1,155 @@
+"""The file of a log; one that is compressed as a whole, by zstd or gzip, is unpacked into a temporary one."""
+
+from __future__ import annotations
+
+import stat
+import tempfile
+import zlib
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import IO
+
+import zstandard
+
+from prim.errors import LogReadError
+
+HEAD_BYTES = 1 << 16
+"""So much of a file's start is read to tell its format."""
+
+PACKED_BYTES = 1 << 12
+"""So much is unpacked at once: a block of zstd may become 2^15 times as large."""
+
+MAX_LAYERS = 4
+"""A file is compressed no more often."""
+
+ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
+"""How a frame of zstd begins: a file, or a message that was compressed by itself. No message in CDR begins so."""
+
+ZSTD_SKIPPABLE_MAGIC = b"\x50\x2a\x4d\x18"
+"""How a frame of zstd begins that has no data, as pzstd puts them before the others (RFC 8878, 3.1.2)."""
+
+
+class _EndsEarlyError(ValueError):
+    """What a file's last frame lacks."""
+
+
+def _unzstd(packed: IO[bytes]) -> Iterator[bytes]:
+    """Yield what a file of one or several frames of zstd holds. Raises ZstdError, _EndsEarlyError."""
+    frame, is_whole = zstandard.ZstdDecompressor().decompressobj(), False
+    while piece := packed.read(PACKED_BYTES):
+        while piece:
+            if is_whole:
+                frame, is_whole = zstandard.ZstdDecompressor().decompressobj(), False
+            yield frame.decompress(piece)
+            is_whole, piece = frame.eof, frame.unused_data if frame.eof else b""
+    if not is_whole:
+        raise _EndsEarlyError("the last frame is not whole")
+
+
+def _gunzip(packed: IO[bytes]) -> Iterator[bytes]:
+    """Yield what a file of one or several members of gzip holds, zeros behind them left out.
+
+    Raises zlib.error, _EndsEarlyError.
+    """
+    member = zlib.decompressobj(wbits=16 + zlib.MAX_WBITS)
+    while piece := packed.read(PACKED_BYTES):
+        while piece:
+            if member.eof:
+                piece = piece.lstrip(b"\0")
+                member = zlib.decompressobj(wbits=16 + zlib.MAX_WBITS) if piece else member
+                continue
+            yield member.decompress(piece)
+            piece = member.unused_data
+    if not member.eof:
+        raise _EndsEarlyError("the last member is not whole")
+
+
+COMPRESSIONS: dict[bytes, tuple[str, Callable[[IO[bytes]], Iterator[bytes]]]] = {
+    ZSTD_MAGIC: ("zstd", _unzstd),
+    ZSTD_SKIPPABLE_MAGIC: ("zstd", _unzstd),
+    b"\x1f\x8b": ("gzip", _gunzip),
+}
+"""What a compression is called, and how its files are unpacked, by their first bytes."""
+
+
+class LogFile:
+    """A file of a log, unpacked where it is compressed.
+
+    Args:
+        path: The file.
+        recover: Keep what could be unpacked of a damaged file.
+
+    Attributes:
+        path: The file as the user names it.
+        data: The file to read: ``path`` itself, or a temporary one.
+        compression: «zstd» or «gzip»; empty where it is not compressed.
+        head: The first bytes of ``data``, as many as tell its format.
+        lost: What could not be unpacked.
+
+    Raises:
+        LogReadError: The file cannot be read, is damaged (unless ``recover``), or cannot be unpacked here.
+    """
+
+    def __init__(self, path: Path, recover: bool = False) -> None:
+        self.path = self.data = path
+        self.compression = ""
+        self.lost: list[str] = []
+        self._folder: tempfile.TemporaryDirectory[str] | None = None
+        self.head = _head(path, path)
+        try:
+            self._unpack_all(recover)
+        except BaseException:
+            self.close()
+            raise
+
+    def close(self) -> None:
+        """Remove the temporary file."""
+        if self._folder:
+            self._folder.cleanup()
+
+    def _unpack_all(self, recover: bool) -> None:
+        """Unpack the file as often as it is compressed. Raises LogReadError."""
+        layers: list[str] = []
+        while (compression := _compression(self.head)) is not None:
+            if len(layers) == MAX_LAYERS:
+                raise LogReadError(self.path, f"compressed more than {MAX_LAYERS} times", "unpack it first")
+            name, unpacked = compression
+            self._unpack(name, unpacked, len(layers), recover)
+            layers.append(name)
+            self.head = _head(self.data, self.path)
+        self.compression = " in ".join(reversed(layers))
+        if layers and not self.head:
+            raise LogReadError(self.path, self.lost[-1] if self.lost else f"empty: {layers[-1]} of no bytes")
+
+    def _unpack(self, name: str, unpacked: Callable[[IO[bytes]], Iterator[bytes]], layer: int, recover: bool) -> None:
+        if self._folder is None:
+            self._folder = tempfile.TemporaryDirectory(prefix="prim-", ignore_cleanup_errors=True)
+        packed, self.data = self.data, Path(self._folder.name) / str(layer)
+        try:
+            with packed.open("rb") as stream, self.data.open("wb") as out:
+                out.writelines(unpacked(stream))
+        except (zstandard.ZstdError, zlib.error, _EndsEarlyError) as error:
+            what = f"damaged: its {name} compression ends early or does not fit ({error})"
+            if not recover:
+                raise LogReadError(self.path, what, "read what is left of it with --recover") from error
+            self.lost.append(what)
+        except OSError as error:
+            raise LogReadError(self.path, f"cannot be unpacked: {error.strerror or error}") from error
+        if layer:
+            packed.unlink()
+
+
+def _compression(head: bytes) -> tuple[str, Callable[[IO[bytes]], Iterator[bytes]]] | None:
+    """Return what a file that begins so is compressed by, and how it is unpacked; None where it is not."""
+    return next((found for magic, found in COMPRESSIONS.items() if head.startswith(magic)), None)
+
+
+def _head(file: Path, path: Path) -> bytes:
+    """Return the first bytes of ``file``; errors name ``path``. Raises LogReadError."""
+    try:
+        if not stat.S_ISREG(file.stat().st_mode):
+            raise LogReadError(path, "a pipe or a device, which cannot be read back and forth", "save it to a file")
+        with file.open("rb") as stream:
+            return stream.read(HEAD_BYTES)
+    except OSError as error:
+        raise LogReadError(path, f"cannot open: {error.strerror}") from error

@@ -1,0 +1,249 @@
+"""A log in several files, one after the other: a ROS 2 bag that was split while it was recorded."""
+
+from __future__ import annotations
+
+import re
+from collections import Counter
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import ExitStack
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from prim.arrays import Stamps
+from prim.errors import LogReadError
+from prim.log.decoding.codecs import SCAN_CONTENTS
+from prim.log.reader import LogReader
+from prim.log.source import Message, Topic
+from prim.log.time_resets import find_shifts, moved_behind_resets, reset_notes
+
+METADATA = "metadata.yaml"
+"""The file in a ROS 2 bag's folder that lists the others."""
+
+COMPRESSED_SUFFIXES = (".zstd", ".zst", ".gz")
+"""How the names of compressed files end."""
+
+_LOG_NAME = re.compile(r"\.(mcap|db3|bag|bag\.active)(\.(zstd|zst|gz))?$")
+"""How the names of logs in a folder end."""
+
+
+def files_of_bag(folder: Path) -> list[Path]:
+    """Find the files of the bag in a folder, in the order in which they were recorded.
+
+    Args:
+        folder: The folder of a ROS 2 bag: with its ``metadata.yaml``, or with one log or the parts of one.
+
+    Returns:
+        The files; those that metadata.yaml lists may be missing.
+
+    Raises:
+        LogReadError: The folder holds no log, or several that do not belong together.
+    """
+    listed = _listed_files(folder)
+    if any(file.exists() for file in listed):
+        return listed
+    by_stem = {_stem(path): path for path in sorted(folder.iterdir(), key=_preference, reverse=True) if _is_log(path)}
+    found = sorted(by_stem.values(), key=_part_number)
+    if not found and listed:
+        return listed
+    if not found:
+        raise LogReadError(folder, "a folder without a log in it", "give a log, or the folder of a ROS 2 bag")
+    if len(found) > 1 and len({_part_number(path)[0] for path in found}) > 1:
+        names = ", ".join(path.name for path in found)
+        raise LogReadError(folder, f"a folder with {len(found)} logs ({names})", f"give one of them: {found[0]}")
+    return found
+
+
+def notes_on_part(path: Path) -> list[str]:
+    """Return what a user should know of a file that metadata.yaml lists as one of several of a bag.
+
+    Args:
+        path: The file.
+
+    Returns:
+        The notes.
+    """
+    names = [file.name for file in _listed_files(path.parent)]
+    if len(names) < 2 or path.name not in names:
+        return []
+    which = (
+        f"{path.name} is part {names.index(path.name) + 1} of {len(names)} of a bag, whose other parts are not read"
+    )
+    return [f"{which} (static transforms, for one, may be in the first): for all give {path.absolute().parent}"]
+
+
+def notes_on_unlisted(folder: Path, files: Sequence[Path]) -> list[str]:
+    """Return what a user should know of parts of a bag in its folder that are not read.
+
+    Args:
+        folder: The folder.
+        files: The files that are read.
+
+    Returns:
+        The notes.
+    """
+    read = {_stem(file) for file in files}
+    bags = {_part_number(file)[0] for file in files}
+    others = [path for path in folder.iterdir() if _is_log(path) and _stem(path) not in read]
+    names = [path.name for path in sorted(others, key=_part_number) if _part_number(path)[0] in bags]
+    return [f"{METADATA} does not list {', '.join(names)}: not read; without {METADATA}, all are"] if names else []
+
+
+def _listed_files(folder: Path) -> list[Path]:
+    """Return the files that the folder's metadata.yaml lists, each once; none where it does not tell."""
+    path = folder / METADATA
+    if not path.is_file():
+        return []
+    from ruamel.yaml import YAML
+    from ruamel.yaml.error import YAMLError
+
+    try:
+        described: Any = YAML(typ="safe", pure=True).load(path.read_text(encoding="utf-8"))
+        names = described["rosbag2_bagfile_information"]["relative_file_paths"]
+    except (OSError, YAMLError, ValueError, KeyError, TypeError, RecursionError):
+        return []  # without it, the files are found by their names
+    if not isinstance(names, list) or not all(isinstance(name, str) and Path(name).name for name in names):
+        return []
+    return list(dict.fromkeys(_present(folder / Path(name).name) for name in names))
+
+
+def _present(file: Path) -> Path:
+    """Return a listed file under the name that it has: rosbag2 forgets or adds the suffix of its compression."""
+    plain = file.with_suffix("") if file.suffix in COMPRESSED_SUFFIXES else file
+    names = (file.name, plain.name, *(plain.name + suffix for suffix in COMPRESSED_SUFFIXES))
+    return next((file.with_name(name) for name in names if file.with_name(name).exists()), file)
+
+
+def _is_log(path: Path) -> bool:
+    return path.is_file() and _LOG_NAME.search(path.name) is not None
+
+
+def _preference(path: Path) -> tuple[bool, str]:
+    """Return what sorts the log that is not compressed before the others of its name."""
+    return path.suffix in COMPRESSED_SUFFIXES, path.name
+
+
+def _stem(path: Path) -> str:
+    return _LOG_NAME.sub("", path.name)
+
+
+def _part_number(path: Path) -> tuple[str, int]:
+    """Return what sorts the parts of a bag: bag_2 comes before bag_10, and what their names have in common.
+
+    rosbag of ROS 1 puts the time at which a part was begun before its number.
+    """
+    number = re.search(r"_(\d+)$", _stem(path))
+    if number is None:
+        return _stem(path), -1
+    return re.sub(r"\d{4}(-\d\d){5}$", "", _stem(path)[: number.start()]), int(number[1])
+
+
+class PartsReader(LogReader):
+    """Several files that are one log: a :class:`prim.log.source.LogSource`. Transforms of one part hold in all.
+
+    Args:
+        path: The log as the user names it.
+        files: Its files, in the order in which they were recorded.
+        recover: Pass over files that are missing or cannot be read.
+        open_file: Opens one of them.
+
+    Raises:
+        LogReadError: A file cannot be read, or with ``recover`` all of them.
+    """
+
+    def __init__(
+        self, path: Path, files: Sequence[Path], recover: bool, open_file: Callable[[Path], LogReader]
+    ) -> None:
+        super().__init__(path, recover)
+        self._stack = ExitStack()
+        self._parts: list[LogReader] = []
+        self._missing: list[str] = []
+        try:
+            for file in files:
+                self._open_part(file, open_file)
+            if not self._parts:
+                raise LogReadError(path, f"none of its {len(files)} files can be read: {'; '.join(self._missing)}")
+        except BaseException:
+            self.close()
+            raise
+        times = self._sort_parts()
+        self.topics = self._merged_topics()
+        self._shifts = find_shifts(np.concatenate(times))
+        self.notes += [note for part in self._parts for note in part.notes]
+        self.notes += reset_notes(self._shifts)
+        self.metadata = {name: values for part in self._parts for name, values in part.metadata.items()}
+
+    def _open_part(self, file: Path, open_file: Callable[[Path], LogReader]) -> None:
+        try:
+            if not file.exists():
+                raise LogReadError(file, f"a file of the bag {self.path} is missing", "read the rest with --recover")
+            self._parts.append(self._stack.enter_context(open_file(file)))
+        except LogReadError as error:
+            if not self._recover:
+                raise
+            self._missing.append(f"{file.name}: {error.what}")
+
+    def close(self) -> None:
+        """Close the files."""
+        self._stack.close()
+
+    @property
+    def format(self) -> str:
+        """The log's format, for people."""
+        return f"{self._parts[0].format} in {len(self._parts)} files"
+
+    @property
+    def lost(self) -> list[str]:
+        """What could not be read so far, for people."""
+        of_parts = (f"{part.path.name}: {lost}" for part in self._parts for lost in part.lost)
+        return [*self._missing, *of_parts, *self._own_losses]
+
+    @lost.setter
+    def lost(self, losses: list[str]) -> None:
+        self._own_losses = losses
+
+    @property
+    def messages_lost(self) -> int | None:
+        """The number of messages that could not be read; None where the log does not say how many there were."""
+        counts = [part.messages_lost for part in self._parts]
+        known = [count for count in counts if count is not None]
+        return None if self._missing or len(known) < len(counts) else sum(known) + len(self._undecodable)
+
+    def _merged_topics(self) -> Mapping[str, Topic]:
+        topics: dict[str, Topic] = {}
+        counts: Counter[str] = Counter()
+        for part in self._parts:
+            for topic in part.topics.values():
+                counts[topic.name] += topic.messages
+                topics[topic.name] = topic._replace(messages=counts[topic.name])
+        return topics
+
+    def attachment(self, name: str) -> bytes | None:
+        """See :meth:`prim.log.source.LogSource.attachment`."""
+        return next((data for part in self._parts if (data := part.attachment(name)) is not None), None)
+
+    def messages(self, *topics: str) -> Iterator[Message]:
+        """See :meth:`prim.log.source.LogSource.messages`."""
+        messages = (message for part in self._parts for message in part.messages(*topics))
+        return moved_behind_resets(messages, self._shifts) if len(self._shifts) > 1 else messages
+
+    def _sort_parts(self) -> list[Stamps]:
+        """Sort the parts by their times, where these do not overlap: metadata.yaml may list them in another order.
+
+        Returns:
+            When the scans of a topic were logged (ns), by parts.
+        """
+        topics = [topic for part in self._parts for topic in part.holding(*SCAN_CONTENTS)]
+        times = [part.log_times(topics[0].name) if topics else np.zeros(0, np.int64) for part in self._parts]
+        order = sorted((of_part.min(), of_part.max(), k) for k, of_part in enumerate(times) if len(of_part))
+        positions = [k for _, _, k in order]
+        if len(order) < len(times) or positions == sorted(positions):
+            return times
+        if any(part.notes for part in self._parts) or any(b[0] < a[1] for a, b in pairwise(order)):
+            return times
+        self._parts = [self._parts[k] for k in positions]
+        names = ", ".join(part.path.name for part in self._parts)
+        self.notes = [f"the files of the bag are read in the order of their times: {names}"]
+        return [times[k] for k in positions]

@@ -1,0 +1,3 @@
+from tests.encodings.conftest import content
+
+__all__ = ["content"]
