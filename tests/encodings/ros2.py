@@ -32,7 +32,18 @@ SPLITS = 3
 MANY_SPLITS = 11
 """More than ten: the names of the parts are then not in the order of the parts."""
 
-_LATCHED_QOS = "- history: 1\n  depth: 1\n  reliability: 1\n  durability: 1\n"
+_ENDLESS = "{sec: 9223372036, nsec: 854775807}"
+_LATCHED_QOS = f"""\
+- history: 1
+  depth: 1
+  reliability: 1
+  durability: 1
+  deadline: {_ENDLESS}
+  lifespan: {_ENDLESS}
+  liveliness: 1
+  liveliness_lease_duration: {_ENDLESS}
+  avoid_ros_namespace_conventions: false
+"""
 
 
 def mcap_bytes(content: LogContent, compress_messages: bool = False, **options: Any) -> bytes:

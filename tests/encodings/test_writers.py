@@ -6,7 +6,7 @@ import gzip
 import json
 import math
 from collections.abc import Iterator
-from dataclasses import fields, is_dataclass
+from dataclasses import fields, is_dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -21,22 +21,14 @@ from rosbags.rosbag1 import Reader as Ros1Reader
 from rosbags.rosbag2 import Reader as Ros2Reader
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-from prim.log.messages import (
-    ODOM_TOPIC,
-    SCAN_TOPIC,
-    TF_STATIC_TOPIC,
-    TF_TOPIC,
-    TF_TYPE,
-    decode_poses,
-    decode_scan,
-    encode_scan,
-    planar_pose,
-)
+from prim.log.decoding.ros import decode_scan
+from prim.log.decoding.values import planar_pose
+from prim.log.messages import ODOM_TOPIC, SCAN_TOPIC, TF_STATIC_TOPIC, TF_TOPIC, TF_TYPE, encode_scan
 from prim.log.source import Message
 from prim.scan import Scan
 from prim.se2 import Pose2D
 from tests.encodings import carmen, foxglove, ros1, ros2
-from tests.encodings.content import LogContent, remounted, without_records
+from tests.encodings.content import LogContent, decode_poses, remounted
 from tests.encodings.table import ENCODINGS, Encoding
 
 ZSTD, GZIP = b"\x28\xb5\x2f\xfd", b"\x1f\x8b"
@@ -95,7 +87,7 @@ def assert_same_fields(ros1_message: Any, ros2_message: Any) -> None:
     """All fields of ROS 2's message that ROS 1's has are equal; no other than these may be missing."""
     ours = {field.name for field in fields(ros1_message)}
     for field in fields(ros2_message):
-        if field.name.isupper():  # a constant of the definition
+        if field.name.isupper() or field.name == "__msgtype__":  # constants of the definition
             continue
         if field.name not in ours:
             assert field.name in {"texture_resource", "texture", "uv_coordinates", "mesh_file"}
@@ -198,15 +190,11 @@ def test_the_mount_is_in_the_first_part_alone(
     assert all(SCAN_TOPIC in found for found in topics)
 
 
-@pytest.mark.parametrize("name", ["mcap-folder", "db3-folder", "db3-foxy"])
+@pytest.mark.parametrize("name", ["mcap-folder", "db3-folder"])
 @pytest.mark.parametrize("mode", ["", "-zstd-file", "-zstd-messages"])
-def test_compression_is_what_the_name_says(content: LogContent, tmp_path: Path, name: str, mode: str) -> None:
-    encoding = BY_NAME.get(name + mode)
-    if encoding is None:
-        pytest.skip("it is not written so")
-    path = encoding.write(content, tmp_path)
-    files = [file for file in path.iterdir() if file.name != "metadata.yaml"] if path.is_dir() else [path]
-    (data,) = (file.read_bytes() for file in files)
+def test_bags_are_compressed_as_the_name_says(content: LogContent, tmp_path: Path, name: str, mode: str) -> None:
+    bag = BY_NAME[name + mode].write(content, tmp_path)
+    (data,) = (file.read_bytes() for file in bag.iterdir() if file.name != "metadata.yaml")
     assert data.startswith(ZSTD) == (mode == "-zstd-file")
     assert (data.count(ZSTD) >= len(content.messages)) == (mode == "-zstd-messages")
 
@@ -245,10 +233,9 @@ def assert_same_transforms(content: LogContent, found: list[tuple[int, Any, Any]
 
 def test_foxglove_json_is_strict_and_knows_no_infinity(content: LogContent, tmp_path: Path) -> None:
     stored = read_back(foxglove.write_json(content, tmp_path))
-    reject = pytest.fail
-    values = {s.topic: [] for s in stored}
+    values: dict[str, list[Any]] = {s.topic: [] for s in stored}
     for s in stored:
-        values[s.topic].append(json.loads(s.data, parse_constant=reject))
+        values[s.topic].append(json.loads(s.data, parse_constant=pytest.fail))
     scans = reduced_scans(foxglove.reduce_to_json(content))
     for value, scan in zip(values[SCAN_TOPIC], scans, strict=True):
         ranges = np.array([math.nan if z is None else z for z in value["ranges"]], np.float32)
@@ -294,7 +281,6 @@ def test_carmen_holds_rounded_scans_and_odometry(
         plane = planar_pose(pose)
         assert [float(v) for v in found[:3]] == pytest.approx([plane.x, plane.y, plane.theta], abs=1e-12)
     scans, recorded = reduced_scans(reduced), reduced_scans(session)
-    assert {"5.00"}.isdisjoint(lines(path, kind)[0])
     for found, scan, whole, robot in zip(lines(path, kind), scans, recorded, odometry, strict=True):
         head, count = (7, int(found[7])) if kind == "ROBOTLASER1" else (0, int(found[0]))
         if kind == "ROBOTLASER1":
@@ -320,19 +306,17 @@ def test_carmen_holds_rounded_scans_and_odometry(
     assert limits["robot_frontlaser_offset"] == pytest.approx(mount.x)
 
 
-def test_flaser_refuses_angles_that_it_does_not_know(content: LogContent, tmp_path: Path) -> None:
-    scan = decode_scan(content.of(SCAN_TOPIC)[0].data)
-    for count, fits in ((181, True), (180, False), (179, False)):
-        cut = Scan(scan.stamp, "laser", scan.angle_min, scan.angle_increment, 0.0, 5.0, scan.ranges[:count])
-        messages = [m._replace(data=encode_scan(cut)) if m.topic == SCAN_TOPIC else m for m in content.messages]
-        session = LogContent(content.types, tuple(messages), {}, {})
-        if fits or count == 180:  # half a turn in 180 steps of a degree, as 180 beams have it
+@pytest.mark.parametrize(("beams", "fits"), [(181, True), (180, True), (179, False), (90, False)])
+def test_flaser_refuses_angles_that_it_does_not_know(
+    content: LogContent, tmp_path: Path, beams: int, fits: bool
+) -> None:
+    """The scanner's beams are a degree apart: half a turn has 180 of them, or 181 with both ends."""
+    (whole, *_) = reduced_scans(content)
+    data = encode_scan(replace(whole, ranges=whole.ranges[:beams]))
+    messages = [m._replace(data=data) if m.topic == SCAN_TOPIC else m for m in content.messages]
+    session = replace(content, messages=tuple(messages))
+    if fits:
+        carmen.write_flaser(session, tmp_path)
+    else:
+        with pytest.raises(ValueError, match="no such angles"):
             carmen.write_flaser(session, tmp_path)
-        else:
-            with pytest.raises(ValueError, match="no such angles"):
-                carmen.write_flaser(session, tmp_path)
-
-
-def test_records_are_what_bags_lack(content: LogContent) -> None:
-    assert content.attachments and content.metadata
-    assert without_records(content).messages == content.messages
