@@ -204,7 +204,8 @@ def write_db3_foxy(content: LogContent, folder: Path) -> Path:
     )
     base.execute("CREATE INDEX timestamp_idx ON messages (timestamp ASC)")
     numbers = {topic: number for number, topic in enumerate(content.types, 1)}
-    rows = [(numbers[topic], topic, kind, "cdr", "") for topic, kind in content.types.items()]
+    qos = {topic: _LATCHED_QOS if topic in LATCHED else "" for topic in content.types}
+    rows = [(numbers[topic], topic, kind, "cdr", qos[topic]) for topic, kind in content.types.items()]
     base.executemany("INSERT INTO topics VALUES(?, ?, ?, ?, ?)", rows)
     messages = [(numbers[topic], log_time, data) for topic, log_time, data in content.messages]
     base.executemany("INSERT INTO messages(topic_id, timestamp, data) VALUES(?, ?, ?)", messages)
