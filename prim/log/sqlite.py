@@ -28,6 +28,9 @@ PENDING = ("-wal", "-journal")
 MAX_STEP = 1 << 40
 """Behind damage, messages are searched for this far on (rows)."""
 
+MAX_ROW = 1 << 62
+"""Rows are numbered no higher, unless they are damaged."""
+
 
 class SqliteBagReader(LogReader):
     """A file of a ROS 2 bag in SQLite that is open for reading: a :class:`prim.log.source.LogSource`.
@@ -151,9 +154,11 @@ class SqliteBagReader(LogReader):
         """Yield rowid and columns of the messages of these topics (none: of all) as written, past what is damaged."""
         query = f"SELECT topic_id, rowid, {columns} FROM messages WHERE rowid > ? ORDER BY rowid LIMIT ?"
         at, step, limit = -1, 0, -1
-        while step < MAX_STEP:
+        while step < MAX_STEP and at < MAX_ROW:
             try:
                 for number, *row in self._base.execute(query, (at, limit)):
+                    if row[0] <= at:
+                        raise sqlite3.DatabaseError("its pages do not fit together")
                     at, step = row[0], 0
                     if not numbers or number in numbers:
                         yield tuple(row)
