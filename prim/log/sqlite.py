@@ -11,8 +11,6 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from prim.arrays import Stamps
 from prim.errors import LogReadError
 from prim.log.decoding.codecs import SCAN_CONTENTS, content_of
@@ -20,7 +18,7 @@ from prim.log.log_file import LogFile
 from prim.log.reader import LogReader
 from prim.log.recovery import RECOVER_HINT
 from prim.log.source import Message, Topic
-from prim.log.time_resets import find_shifts, moved_behind_resets, reset_notes
+from prim.log.time_resets import as_stamps, find_shifts, moved_behind_resets, reset_notes
 
 PENDING = ("-wal", "-journal")
 """What SQLite appends to the name of a file for one with changes that are still to be made: of a killed recorder."""
@@ -119,7 +117,7 @@ class SqliteBagReader(LogReader):
             with _translated_errors(self.path, RECOVER_HINT):
                 query = f"SELECT {columns} FROM messages WHERE {where} ORDER BY rowid"
                 times = [time for (time,) in self._base.execute(query)]
-        return find_shifts(np.array(times, dtype=np.int64))
+        return find_shifts(as_stamps(times))
 
     def log_times(self, topic: str) -> Stamps:
         """See :meth:`prim.log.reader.LogReader.log_times`: without reading the messages."""
@@ -130,7 +128,7 @@ class SqliteBagReader(LogReader):
             f"SELECT timestamp FROM messages WHERE topic_id IN ({', '.join('?' * len(numbers))}) ORDER BY timestamp"
         )
         with _translated_errors(self.path, RECOVER_HINT):
-            return np.array([time for (time,) in self._base.execute(query, numbers)], dtype=np.int64)
+            return as_stamps(time for (time,) in self._base.execute(query, numbers))
 
     def messages(self, *topics: str) -> Iterator[Message]:
         """See :meth:`prim.log.source.LogSource.messages`; a log that is recovered is read in the order of writing."""
