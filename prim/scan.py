@@ -102,7 +102,7 @@ class Scan:
             angles = f"angle_min {self.angle_min:g}, angle_increment {self.angle_increment:g}"
             return f"{angles}, range_min {self.range_min:g}"
         if len(self.ranges) > 1 and self.angle_increment == 0:
-            return "angle_increment 0, and angle_min and angle_max do not tell more"
+            return "angle_increment 0, and no other angle_max than angle_min"
         if max(abs(self.angle_min), abs(self.angle_increment) * (len(self.ranges) - 1)) > MAX_FIELD:
             angles = f"angle_min {self.angle_min:g}, angle_increment {self.angle_increment:g}"
             return f"{angles} for {len(self.ranges)} beams: these are no radians"
@@ -249,7 +249,7 @@ def reconciled_angles(scan: Scan) -> tuple[Scan, str | None]:
             does not contradict it: many drivers count one beam more or less.
 
     Returns:
-        The scan, itself where nothing contradicts, or its ends do not tell more; and what contradicts what and
+        The scan, itself where nothing contradicts, or its ends say no more; and what contradicts what and
         which is used, None where nothing does.
     """
     steps = len(scan.ranges) - 1

@@ -192,6 +192,11 @@ def compose_poses(poses: FloatArray, children: FloatArray) -> FloatArray:
     return np.column_stack((x, y, poses[:, 2] + children[:, 2]))
 
 
+def inverse_poses(poses: FloatArray) -> FloatArray:
+    """Return the inverses (N, 3) of poses (N, 3): what they are composed with to give the identity."""
+    return relative_poses(poses, np.zeros_like(poses))
+
+
 def relative_poses(poses: FloatArray, others: FloatArray) -> FloatArray:
     """Compute poses relative to others, pairwise: the inverse of :func:`compose_poses`, with headings wrapped.
 

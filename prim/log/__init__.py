@@ -128,6 +128,6 @@ _UNSUPPORTED = {
 """First bytes of files that cannot be read, what they are, and what to do."""
 
 TAR_AT, TAR_MAGIC = 257, b"ustar"
-"""What tells a tar archive, and at which byte."""
+"""The magic of a tar archive, and at which byte it is."""
 
 _KNOWN = "give an MCAP log, a ROS 1 or ROS 2 bag, or a log of CARMEN"

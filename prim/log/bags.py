@@ -57,7 +57,7 @@ class Ros1BagReader(LogReader):
             self._bag.close()
 
     def _find_shifts(self) -> tuple[int, ...]:
-        """Find out whether the log's times were set back: where chunks do, the messages of a scanner tell."""
+        """Find out whether the log's times were set back: where those of chunks do, by the messages of a scanner."""
         chunks = sorted(self._bag.chunk_infos, key=lambda chunk: chunk.pos)
         scans = next((name for name, topic in self.topics.items() if topic.content in SCAN_CONTENTS), None)
         if scans is None or not any(b.start_time < a.end_time - MIN_RESET for a, b in pairwise(chunks)):

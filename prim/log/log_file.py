@@ -14,7 +14,7 @@ import zstandard
 from prim.errors import LogReadError
 
 HEAD_BYTES = 1 << 16
-"""So much of a file's start is read to tell its format."""
+"""So much of a file's start is read to find its format."""
 
 PACKED_BYTES = 1 << 12
 """So much is unpacked at once: a block of zstd may become 2^15 times as large."""
@@ -83,7 +83,7 @@ class LogFile:
         path: The file as the user names it.
         data: The file to read: ``path`` itself, or a temporary one.
         compression: «zstd» or «gzip»; empty where it is not compressed.
-        head: The first bytes of ``data``, as many as tell its format.
+        head: The first bytes of ``data``, as many as its format is found by.
         lost: What could not be unpacked.
 
     Raises:

@@ -92,7 +92,7 @@ def notes_on_unlisted(folder: Path, files: Sequence[Path]) -> list[str]:
 
 
 def _listed_files(folder: Path) -> list[Path]:
-    """Return the files that the folder's metadata.yaml lists, each once; none where it does not tell."""
+    """Return the files that the folder's metadata.yaml lists, each once; none where it lists none."""
     path = folder / METADATA
     if not path.is_file():
         return []

@@ -136,7 +136,7 @@ class SqliteBagReader(LogReader):
         return moved_behind_resets(found, self._shifts) if len(self._shifts) > 1 else found
 
     def _stored_messages(self, numbers: Sequence[int]) -> Iterator[Message]:
-        """Yield the messages of these topics: by their times, or as they were written where that tells more."""
+        """Yield the messages of these topics: by their times, or as they were written where that is more."""
         if self._recover:
             for _, number, time, data in self._rows("topic_id, timestamp, data", numbers):
                 yield Message(self._numbers[number], time, data or b"")

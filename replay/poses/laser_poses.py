@@ -142,7 +142,7 @@ class LaserPoses:
             is known.
         sensors: The sensors that the poses were fused from.
         fusion: The fusion that they come from.
-        mounts: The laser's poses (N, 3) on the robot whose poses were fused.
+        mounts: The laser's poses (N, 3) on the robot, where poses were fused or there are several lasers.
         matched: Whether the poses are corrected by matching the scans with the map.
         mount_assumed: Whether the laser is only taken to be at the robot's origin: its mount is not in the log.
     """

@@ -182,7 +182,7 @@ class SensorMounts:
         return LaserMounts(poses, upside_down, notes + self.tree_notes, assumed)
 
     def _base_of(self, frame: str) -> str:
-        """Return the frame of the robot that carries a laser, as static transforms tell it."""
+        """Return the frame of the robot that carries a laser, by static transforms."""
         chain = self._static_tree.chain(frame)
         return BASE_FRAME if BASE_FRAME in chain or len(chain) == 1 else chain[-1]
 

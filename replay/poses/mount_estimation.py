@@ -1,13 +1,13 @@
 """The laser's pose on the robot, estimated from the robot's motion and the scans (extrinsic or hand-eye calibration).
 
-Between two scans i and j the robot moved by U, which its poses tell, and the laser by Z = M^-1 U M, where M is the
+Between two scans i and j the robot moved by U, which its poses give, and the laser by Z = M^-1 U M, where M is the
 laser's pose on the robot. The scans of many pairs are registered (:mod:`replay.poses.scan_registration`), and the M
 that fits best is found by Gauss and Newton, together with each pair's Z: the likelihood of Z by the scans, to second
 order, times that by U, whose errors have variances that grow in proportion to the distance travelled and are
 estimated along (compare Censi et al., «Simultaneous calibration of odometry and sensor parameters for mobile robots»,
 2013). Pairs are independent of any map, which would have been drawn with a wrong M.
 
-A turn tells the laser's position, a path its heading. What the motion does not tell is fixed at 0.
+A turn determines the laser's position, a path its heading. What the motion does not determine is fixed at 0.
 """
 
 from __future__ import annotations
@@ -107,7 +107,7 @@ class MountEstimationOptions:
     """Added to the information about a pair's residual (1/m^2, 1/rad^2), which may be singular."""
 
     prior_position_std: float = 1.0
-    """Standard deviation (m) of a prior around the robot's origin, for what the motion does not tell."""
+    """Standard deviation (m) of a prior around the robot's origin, for what the motion does not determine."""
 
     prior_heading_std: float = math.pi
     """Standard deviation (rad) of a prior around 0."""
@@ -125,10 +125,10 @@ class MountEstimationOptions:
     """The same for the heading (rad)."""
 
     max_position_std: float = 0.03
-    """The motion does not tell x or y where its standard deviation (m) is larger."""
+    """The motion does not determine x or y where its standard deviation (m) is larger."""
 
     max_heading_std: float = math.radians(3)
-    """The motion does not tell the heading where its standard deviation (rad) is larger."""
+    """The motion does not determine the heading where its standard deviation (rad) is larger."""
 
     significance: float = 3.0
     """A component is significant where it differs from 0 by more than this many standard deviations ..."""
@@ -154,22 +154,24 @@ class MountEstimate:
     """An estimate of the laser's pose on the robot.
 
     Attributes:
-        mount: (3,) x, y (m), heading (rad); 0 where the motion does not tell it.
+        mount: (3,) x, y (m), heading (rad); 0 where the motion does not determine it.
         std: (3,) standard deviations (m, rad).
-        told: (3,) whether the motion tells the component.
+        determined: (3,) whether the motion determines the component.
         gain: The share by which the misfit of the scans is lower than with the laser at the robot's origin.
     """
 
     mount: FloatArray
     std: FloatArray
-    told: NDArray[np.bool_]
+    determined: NDArray[np.bool_]
     gain: float
 
     def is_significant(self, options: MountEstimationOptions = DEFAULTS) -> bool:
-        """Return whether the laser is elsewhere than at the robot's origin, as far as the motion tells."""
+        """Return whether the laser is elsewhere than at the robot's origin, as far as the motion determines it."""
         least = np.array([options.min_position, options.min_position, options.min_heading])
         threshold = np.maximum(options.significance * self.std, least)
-        return bool((self.told & (np.abs(self.mount) > threshold)).any()) and self.gain >= options.min_misfit_gain
+        return (
+            bool((self.determined & (np.abs(self.mount) > threshold)).any()) and self.gain >= options.min_misfit_gain
+        )
 
     def note(self) -> str:
         """Return what the scans suggest, with the option that takes it."""
@@ -179,11 +181,11 @@ class MountEstimate:
             _rounded(math.degrees(self.mount[2]), math.degrees(self.std[2]), 1),
         ]
         names, units = ("x", "y", "heading"), ("m", "m", "degrees")
-        told = [f"{names[k]} {' ± '.join(shown[k])} {units[k]}" for k in range(3) if self.told[k]]
-        untold = [names[k] for k in range(3) if not self.told[k]]
-        taken = f" (the motion does not determine {' and '.join(untold)}: 0 is assumed)" if untold else ""
+        estimated = [f"{names[k]} {' ± '.join(shown[k])} {units[k]}" for k in range(3) if self.determined[k]]
+        fixed = [names[k] for k in range(3) if not self.determined[k]]
+        taken = f" (the motion does not determine {' and '.join(fixed)}: 0 is assumed)" if fixed else ""
         return (
-            f"the scans agree best with the laser at {', '.join(told)} on the robot{taken}; to use it: "
+            f"the scans agree best with the laser at {', '.join(estimated)} on the robot{taken}; to use it: "
             f"--laser-offset {' '.join(value for value, _ in shown)}"
         )
 
@@ -205,12 +207,12 @@ def estimate_mount(
         options: The numbers.
 
     Returns:
-        The estimate; None where the motion or the scans do not tell anything.
+        The estimate; None where the motion or the scans determine nothing.
     """
     pairs = _ScanPairs.choose(poses, stamps, source, options)
     if pairs is None:
         return None
-    with np.errstate(all="ignore"):  # what overflows is not finite, and then nothing is told
+    with np.errstate(all="ignore"):  # what overflows is not finite, and then nothing is determined
         return MountEstimator(pairs, options).run()
 
 
@@ -340,7 +342,7 @@ def _spread_pairs(travel: FloatArray, options: MountEstimationOptions) -> NDArra
 
 
 def _inverses(matrices: linear_algebra.Matrix) -> FloatArray:
-    """Return the inverses (P, K, K) of matrices; NaN where one is singular: then nothing is told."""
+    """Return the inverses (P, K, K) of matrices; NaN where one is singular: then nothing is determined."""
     inverses = linear_algebra.solve(matrices, np.broadcast_to(np.eye(matrices.shape[1]), matrices.shape))
     return np.full(matrices.shape, np.nan) if inverses is None else inverses
 
@@ -423,7 +425,7 @@ class MountEstimator:
         self._prior = np.diag([options.prior_position_std**-2] * 2 + [options.prior_heading_std**-2])
 
     def run(self) -> MountEstimate | None:
-        """Estimate all components; while the motion does not tell one, fix it at 0 and estimate the others anew."""
+        """Estimate all components; while one is not determined, fix it at 0 and estimate the others anew."""
         options = self._options
         limits = np.array([options.max_position_std, options.max_position_std, options.max_heading_std])
         free, std = np.ones(3, dtype=bool), np.zeros(3)

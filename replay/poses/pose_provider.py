@@ -210,7 +210,8 @@ class PoseProvider:
         mounts, upside_down, notes, assumed = self._mounts.laser_mounts(scans, odometry.base_frame)
         notes += self._gap_note(topic.name, odometry.trajectory.stamps, scans.stamps) + odometry.notes
         poses = compose_poses(robot, mounts)
-        return LaserPoses(source, topic.name, poses, valid, upside_down, notes, mount_assumed=assumed)
+        several = mounts if len(scans.frame_ids) > 1 else None
+        return LaserPoses(source, topic.name, poses, valid, upside_down, notes, mounts=several, mount_assumed=assumed)
 
     def _from_tf(self, scans: ScanTimes, chains: Sequence[list[str]]) -> LaserPoses:
         """Return the lasers' poses in the fixed frame of tf: by their chains, else at the robot's frame."""
@@ -239,7 +240,9 @@ class PoseProvider:
             raise LogReadError(self._log.path, what, f"choose one scanner with --scan-topic {scans.topics[0]}")
         notes += tuple(f"{frame} has several parents in tf: {parent} is used" for frame, parent in tree.conflicts)
         unique = tuple(dict.fromkeys(notes))
-        return LaserPoses("tf", ", ".join(origins), poses, valid, upside_down, unique, mount_assumed=assumed)
+        origin = ", ".join(origins)
+        mounts = self._mounts.laser_mounts(scans, robot or roots[0]).poses if len(scans.frame_ids) > 1 else None
+        return LaserPoses("tf", origin, poses, valid, upside_down, unique, mounts=mounts, mount_assumed=assumed)
 
     def _tf_link(self, name: str, chain: list[str], robot: str | None) -> _TfLink:
         """Return how a laser is found in tf: by its own chain, else by the robot's. Raises LogReadError."""

@@ -29,6 +29,7 @@ from prim.se2 import (
     compose_covariances,
     compose_poses,
     frame_covariances,
+    inverse_poses,
     relative_poses,
     relative_steps,
     wrap_angles,
@@ -133,8 +134,8 @@ def match_scans(
 class ScanMatcher:
     """The implementation and state of :func:`match_scans`, and with its arguments.
 
-    The state is a pose at each node of a fusion: the robot's where the given poses were fused; else the laser's own,
-    and the mounts are zero.
+    The state is a pose at each node of a fusion: the robot's where the mounts are given, as those of fused poses
+    and of several lasers are; else the laser's own, and the mounts are zero.
     """
 
     def __init__(
@@ -152,7 +153,7 @@ class ScanMatcher:
         self._resolution, self._noise_std, self._bounds = resolution, noise_std, bounds
         self._fusion = poses.fusion or _fusion_of(poses, stamps, noise or SensorNoise(), options)
         self._drifts = not self._fusion.nodes.has_fix.any()
-        self._mounts = np.zeros_like(poses.poses) if poses.mounts is None or not poses.fusion else poses.mounts
+        self._mounts = np.zeros_like(poses.poses) if poses.mounts is None else poses.mounts
         nodes = self._fusion.nodes.stamps
         self._node_of_scan = np.searchsorted(nodes, np.clip(stamps, nodes[0], nodes[-1]))
         estimate = self._fusion.smoothed()
@@ -371,7 +372,8 @@ def _fusion_of(poses: LaserPoses, stamps: Stamps, noise: SensorNoise, options: S
     They are the steps of an odometry. Where their noise is known, they are fixes and headings instead, and the steps
     between them are those of an odometry that has ``free_step_factor`` times their standard deviations each.
     """
-    trajectory = Trajectory.from_unsorted(stamps[poses.valid], poses.poses[poses.valid])
+    carriers = poses.poses if poses.mounts is None else compose_poses(poses.poses, inverse_poses(poses.mounts))
+    trajectory = Trajectory.from_unsorted(stamps[poses.valid], carriers[poses.valid])
     position_std, heading_std = noise.position_std, noise.heading_std
     if position_std is None or heading_std is None:
         return Fusion(FusionNodes.from_readings(trajectory.stamps, trajectory, None, None), noise)

@@ -28,7 +28,7 @@ SECOND = 1_000_000_000
 """Nanoseconds."""
 
 MIN_POSES = 3
-"""Fewer poses than these tell nothing of their clock: someone gave them by hand; set by hand."""
+"""Fewer poses than these say nothing of their clock: someone gave them by hand; set by hand."""
 
 
 @dataclass(frozen=True)
@@ -54,10 +54,10 @@ class ClockOptions:
     """Drift is at least this many standard errors."""
 
     min_messages: int = 10
-    """Fewer messages tell no drift."""
+    """A drift is not estimated from fewer messages."""
 
     first: int = 500
-    """So many of the first messages of a topic tell whether poses are stamped by another clock at all."""
+    """By so many of the first messages of a topic it is decided whether poses are stamped by another clock at all."""
 
     sampled: int = 20_000
     """No more messages of a topic are read to find its clock."""

@@ -79,7 +79,7 @@ class CloudSlicer:
         bearings = np.arctan2(points[:, 1], points[:, 0])
         if not self._beams:
             self._choose_beams(bearings)
-        if not self._beams:  # too few points to tell: their bearings would be those of no beam
+        if not self._beams:  # too few points to choose by: their bearings would be those of no beam
             points, bearings = points[:0], bearings[:0]
         increment = 2 * math.pi / max(self._beams, 1)
         ranges = np.full(self._beams, np.inf)

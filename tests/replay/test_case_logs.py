@@ -62,3 +62,9 @@ def test_messages_of_ros1_in_mcap_are_read() -> None:
     result = replayed("ros1_in_mcap")
     assert [str(primitive.kind) for primitive in result.primitives] == ["circle"] * 4
     assert all(primitive.size["radius"] == pytest.approx(0.15, abs=0.005) for primitive in result.primitives)
+
+
+def test_scans_of_two_scanners_are_matched_as_those_of_one_robot() -> None:
+    result = replayed("two_lidars", match_scans=True)
+    assert sorted(str(primitive.kind) for primitive in result.primitives) == ["circle", "square"]
+    assert result.grid.frame.rows < 320

@@ -1,4 +1,4 @@
-"""The laser's mount by the robot's motion and the scans: what is found, what the motion tells, and the note."""
+"""The laser's mount by the robot's motion and the scans: what is found, what the motion determines, and the note."""
 
 import math
 import re
@@ -103,7 +103,7 @@ def errors(found: MountEstimate, mount: Pose2D) -> FloatArray:
 )
 def test_a_winding_path_tells_the_mount(mount: Pose2D) -> None:
     found = Drive(winding(), mount).estimate()
-    assert found is not None and found.told.all() and found.is_significant()
+    assert found is not None and found.determined.all() and found.is_significant()
     assert np.abs(errors(found, mount)[:2]).max() < POSITION
     assert abs(errors(found, mount)[2]) < HEADING
     assert (np.abs(errors(found, mount)) < 3 * found.std).all()
@@ -112,13 +112,13 @@ def test_a_winding_path_tells_the_mount(mount: Pose2D) -> None:
 
 def test_a_laser_at_the_origin_is_found_there_and_nothing_is_suggested() -> None:
     found = Drive(winding(), Pose2D()).estimate()
-    assert found is not None and found.told.all() and not found.is_significant()
+    assert found is not None and found.determined.all() and not found.is_significant()
     assert np.abs(found.mount).max() < POSITION
 
 
 def test_a_straight_path_tells_the_heading_alone() -> None:
     found = Drive(straight(), OFF).estimate()
-    assert found is not None and found.told.tolist() == [False, False, True]
+    assert found is not None and found.determined.tolist() == [False, False, True]
     assert abs(errors(found, OFF)[2]) < HEADING
     assert found.mount[:2].tolist() == [0, 0]
     assert "does not determine x and y: 0 is assumed); to use it: --laser-offset 0.000 0.000 25.0" in found.note()
@@ -127,7 +127,7 @@ def test_a_straight_path_tells_the_heading_alone() -> None:
 def test_turns_on_the_spot_tell_the_distance_from_the_centre_but_no_heading() -> None:
     """With the heading taken to be 0 the position is that of the same laser on a robot that is turned itself."""
     found = Drive(spinning(), OFF).estimate()
-    assert found is not None and found.told.tolist() == [True, True, False] and found.mount[2] == 0
+    assert found is not None and found.determined.tolist() == [True, True, False] and found.mount[2] == 0
     turned = Pose2D(0, 0, -OFF.theta) @ Pose2D(OFF.x, OFF.y)
     assert found.mount[:2] == pytest.approx([turned.x, turned.y], abs=POSITION)
 
@@ -154,7 +154,7 @@ def test_positions_that_wander_as_a_gps_does_suggest_nothing(seed: int) -> None:
         error[k, :2] = 0.97 * error[k - 1, :2] + steps[k - 1]
     drive.robot = winding() + error
     found = drive.estimate()
-    assert found is not None and found.told[2] and abs(found.mount[2]) > 5 * found.std[2]
+    assert found is not None and found.determined[2] and abs(found.mount[2]) > 5 * found.std[2]
     assert not found.is_significant()
 
 
@@ -305,7 +305,7 @@ def test_fused_and_matched_poses_have_the_note_too(tmp_path: Path) -> None:
 
 
 def test_the_mount_of_a_turtlebot(real_log: Callable[[str], Path]) -> None:
-    """Its laser is at (-0.032, 0, 0), which the log does not tell."""
+    """Its laser is at (-0.032, 0, 0), which the log does not say."""
     note = suggestion(real_log("pillars4.mcap"))
     assert note is not None
     x, y, heading = offset_of(note)
@@ -328,7 +328,7 @@ def test_twenty_sessions_by_exact_poses(tmp_path: Path, motion: str) -> None:
         options = {"motion": motion, "rate": 5.0, "explorer": ExplorerOptions(margin=0.18)}
         mount = random_mount(seed)
         found = estimate_of(recorded(tmp_path, seed, mount, **options), "truth")
-        assert found.told.all() and found.is_significant()
+        assert found.determined.all() and found.is_significant()
         off.append(errors(found, mount))
         std.append(found.std)
         centred = estimate_of(recorded(tmp_path, 1000 + seed, Pose2D(), **options), "truth")
@@ -348,7 +348,7 @@ def test_standard_deviations_by_odometry_that_drifts(tmp_path: Path, translation
         options = {"motion": "drive", "rate": 5.0, "odometry": noise, "explorer": explorer}
         path, mount = recorded(tmp_path, seed, random_mount(seed), **options), random_mount(seed)
         found = estimate_of(path, "odom")
-        ratios.append((errors(found, mount) / found.std)[found.told])
+        ratios.append((errors(found, mount) / found.std)[found.determined])
     every = np.concatenate(ratios)
     assert (np.abs(every) < 2).mean() > 0.88
     assert 0.5 < math.sqrt((every**2).mean()) < 1.3

@@ -49,6 +49,8 @@ def test_scanners_of_one_robot_are_mapped_together(tmp_path: Path) -> None:
         assert scans.names == "/front, /rear"
         assert scans.scanner.tolist() == [0, 1] * 4
         poses = PoseProvider(scans.log).laser_poses(scans.times, "odom")
+        assert poses.mounts is not None
+        assert poses.mounts[:2].tolist() == [[0.3, 0.0, 0.0], [-0.2, 0.1, pytest.approx(np.pi)]]
         posed = list(PosedScans(scans, poses))
         assert any("2 scanners of one robot" in note for note in scans.notes())
     assert [p.scan.frame_id for p in posed] == ["front", "rear"] * 4
