@@ -29,7 +29,7 @@ from prim.log.log_file import LogFile
 from prim.log.reader import LogReader, ros2_name
 from prim.log.recovery import RECORD_LIMIT, RECOVER_HINT, RecordReader, read_chunk, translated_errors
 from prim.log.source import Message, Topic
-from prim.log.time_resets import find_shifts, moved_behind_resets, reset_notes
+from prim.log.time_resets import as_stamps, find_shifts, moved_behind_resets, reset_notes
 
 MAGIC = b"\x89MCAP0\r\n"
 
@@ -185,7 +185,7 @@ class McapReader(LogReader):
         if self._recover or self._summary is None or not self._summary.chunk_indexes:
             name = self._contents.channels[min(scans)].topic
             times = [message.log_time for message in self._unindexed_messages((name,))]
-            shifts = find_shifts(np.array(times, dtype=np.int64))
+            shifts = find_shifts(as_stamps(times))
         else:
             with translated_errors(self.path):
                 parts = list(self._written_times(self._summary, min(scans)))
