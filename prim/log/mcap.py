@@ -136,8 +136,11 @@ class McapReader(LogReader):
         if len(self._shifts) > 1:
             yield from moved_behind_resets(self._unindexed_messages(topics), self._shifts)
             return
-        if self._recover or self._summary is None or not self._summary.chunk_indexes:
+        if self._recover:
             yield from self._unindexed_messages(topics)
+            return
+        if self._summary is None or not self._summary.chunk_indexes:
+            yield from self._sorted_messages(topics)
             return
         delivered: Counter[str] = Counter()
         with translated_errors(self.path):
@@ -204,6 +207,13 @@ class McapReader(LogReader):
                 if opcode != Opcode.MESSAGE_INDEX:
                     raise McapError(f"no index of messages at byte {at}")
                 yield entries[np.argsort(entries[:, 1], kind="stable"), 0].astype(np.int64)
+
+    def _sorted_messages(self, topics: tuple[str, ...]) -> Iterator[Message]:
+        """Yield messages without an index by log time: those of a log in another order are all read at first."""
+        times = (message.log_time for message in self._unindexed_messages(topics))
+        if all(earlier <= later for earlier, later in pairwise(times)):
+            return self._unindexed_messages(topics)
+        return iter(sorted(self._unindexed_messages(topics), key=lambda message: message.log_time))
 
     def _unindexed_messages(self, topics: tuple[str, ...]) -> Iterator[Message]:
         names = {number: channel.topic for number, channel in self._contents.channels.items()}
