@@ -18,6 +18,9 @@ if TYPE_CHECKING:
 
 _FLAG = re.compile(r"(?<![\w./-])--([a-z][a-z0-9-]*)")
 
+_RENAMED = {"slice": "height_slice"}
+"""Parameters that are called otherwise than their options, by these: Python has a ``slice`` of its own."""
+
 _NUMBER = r"[-+]?[0-9.]+(?:e[-+]?[0-9]+)?"
 _OFFSET = re.compile(rf"--laser-offset (?:X Y DEG|({_NUMBER}) ({_NUMBER}) ({_NUMBER}))")
 """The option whose angle is in degrees, with what stands behind it."""
@@ -121,7 +124,7 @@ def name_parameters(text: str, parameters: Collection[str], switches: Collection
     """
 
     def parameter(match: re.Match[str]) -> str:
-        name = match[1].replace("-", "_")
+        name = _RENAMED.get(match[1], match[1].replace("-", "_"))
         if name in switches:
             return f"{name}=True"
         if name.removeprefix("no_") in switches:
