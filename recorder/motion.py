@@ -246,8 +246,8 @@ class Explorer:
         rows = range(math.floor(y0 / cell), math.ceil(y1 / cell))
         cols = range(math.floor(x0 / cell), math.ceil(x1 / cell))
         if len(rows) * len(cols) > self._options.max_cells:
-            part = math.sqrt(self._options.max_cells / (len(rows) * len(cols)))
-            smaller = " ".join(f"{0.99 * part * side:.3g}" for side in (x1 - x0, y1 - y0))
+            longest = (math.isqrt(self._options.max_cells) - 2) * cell  # two cells reach beyond the edges
+            smaller = " ".join(f"{min(side, longest):g}" for side in (x1 - x0, y1 - y0))
             raise UsageError(
                 f"a floor of {x1 - x0:g} x {y1 - y0:g} m is too large to drive on: give --size {smaller} or less, "
                 "or a smaller --world"

@@ -52,17 +52,22 @@ def _of_help(tree: ast.Module) -> Iterator[ast.AST]:
             yield from node.values
 
 
-def hints_of_sources() -> dict[str, str]:
-    """All texts of the sources that suggest something, and the file of each."""
+def texts_of_sources() -> dict[str, str]:
+    """All texts in the sources, {} where values stand in them, and the file of each."""
     found = {}
     for path in (path for package in PACKAGES for path in sorted((ROOT / package).rglob("*.py"))):
         tree = ast.parse(path.read_text(encoding="utf-8"))
         ignored = {id(node) for node in _of_help(tree)}
         for node in ast.walk(tree):
             text = None if id(node) in ignored else _text(node)
-            if text and "\n" not in text and _suggests(text):
+            if text and "\n" not in text:
                 found[text] = path.relative_to(ROOT).as_posix()
     return found
+
+
+def hints_of_sources() -> dict[str, str]:
+    """Those of the texts that suggest something."""
+    return {text: place for text, place in texts_of_sources().items() if _suggests(text)}
 
 
 def _suggests(text: str) -> bool:
