@@ -8,6 +8,8 @@ import re
 import shlex
 import sys
 from collections.abc import Callable
+from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
@@ -19,8 +21,12 @@ from detect.training.dataset import image_style, load_samples
 from mapping.grid import GridFrame
 from prim import console
 from recorder.cli import app as record
+from recorder.motion import ExplorerOptions
+from recorder.sensors import Lidar
+from recorder.session import SessionOptions, record_session
+from recorder.world import WorldOptions
 from replay.cli import app as replay
-from replay.intervals import DETECTED_CELLS, MAP_SNAPSHOT_CELLS, detection_interval, snapshot_interval
+from replay.intervals import DETECTED_CELLS, MAP_SNAPSHOT_CELLS, Interval, detection_interval, snapshot_interval
 from replay.options import ReplayOptions
 from tests import hints
 from tests.replay.test_hints import SITUATIONS, TWO, turning, write
@@ -79,10 +85,7 @@ RECORDINGS = {
         "the robot finds no room to drive: give",
         QUICK + "--motion drive --duration 1 --per-kind 1 --size 0.4 0.4 --kinds square",
     ),
-    "a large floor": Recording(
-        "m is too large to drive on: give", QUICK + "--motion drive --duration 1 --per-kind 0 --size 5000 20"
-    ),
-    "many primitives": Recording("do not fit on", QUICK + "--per-kind 12 --stops 2 2"),
+    "many primitives": Recording("do not fit on", QUICK + "--per-kind 40 --stops 2 2"),
     "a small floor": Recording("do not fit on", QUICK + "--per-kind 1 --stops 2 2 --size 0.1 3"),
 }
 
@@ -95,6 +98,22 @@ def test_what_is_suggested_for_a_recording_helps(run: Run, name: str) -> None:
     assert code == recording.code and suggestion, printed
     code, printed = run("prim-record", *recording.arguments.split(), *hints.suggested_option(suggestion, record))
     assert code == 0 and not hints.find(recording.hint, printed), printed
+
+
+def test_a_floor_that_is_too_large_to_drive_on_is_made_smaller(in_tmp: Path) -> None:
+    options = SessionOptions(
+        motion="drive",
+        duration=1,
+        lidar=Lidar(rays=20),
+        world=WorldOptions(size=(30, 0.5), per_kind=(0, 0)),
+        explorer=ExplorerOptions(max_cells=3000),
+    )
+    with pytest.raises(prim.UsageError) as error:
+        record_session(Path("a.mcap"), options)
+    suggestion = hints.find("m is too large to drive on: give", str(error.value))
+    width, height = map(float, hints.suggested_option(suggestion, record)[1:])
+    assert height == 0.5 and 2 < width < 30
+    record_session(Path("a.mcap"), replace(options, world=replace(options.world, size=(width, height))))
 
 
 def test_a_recording_names_the_form_of_a_range_and_the_command_that_replays_it(run: Run) -> None:
@@ -116,7 +135,8 @@ def test_sets_to_train_on_are_made_by_the_commands_that_are_named(run: Run) -> N
     for mapper, small in {"det": ["--maps", "1", "1"], "drawings": ["--images", "1", "1"]}.items():
         command = without_set(f"a {mapper} set", mapper)
         assert run(*command, *small, "--quiet") == (0, "")
-        assert load_samples(Path(f"a {mapper} set"), mapper, "val")
+        assert (Path(f"a {mapper} set") / f"{mapper}.yaml").exists()
+    assert load_samples(Path("a det set"), "det", "val")
     command = without_set("a det set", "prob")  # whose folder holds another one
     assert run(*command, "--maps", "1", "1", "--quiet") == (0, "") and load_samples(Path(command[2]), "prob", "val")
     with pytest.raises(prim.UsageError, match="make one with: prim-train dataset none --mapper det"):
@@ -136,14 +156,11 @@ def test_the_export_of_a_pickle_is_a_command_that_can_be_given(run: Run) -> None
 
 
 def test_intervals_that_are_suggested_are_shorter() -> None:
-    for interval, name, cells in (
-        (lambda options, scans, cells: snapshot_interval(options, scans, cells), "map_every", MAP_SNAPSHOT_CELLS),
-        (
-            lambda options, scans, cells: detection_interval(options, scans, cells, True),
-            "detect_every",
-            DETECTED_CELLS,
-        ),
-    ):
+    choices: list[tuple[Callable[[ReplayOptions, int, int], Interval], str, int]] = [
+        (snapshot_interval, "map_every", MAP_SNAPSHOT_CELLS),
+        (partial(detection_interval, is_shown=True), "detect_every", DETECTED_CELLS),
+    ]
+    for interval, name, cells in choices:
         for share in (1 / 3, 2.0):
             found = interval(ReplayOptions(), 700, round(cells * share))
             option, value = hints.suggested_option(hints.find("more often with", found.note), replay)
@@ -151,30 +168,28 @@ def test_intervals_that_are_suggested_are_shorter() -> None:
             assert not interval(ReplayOptions(**{name: int(value)}), 700, round(cells * share)).note
 
 
-CALLS: dict[str, tuple[Callable[..., object], dict[str, object], str]] = {
-    "scan_topic": (prim.replay, {}, r"choose one with (scan_topic) ([^ ,]+)"),
-    "clock": (prim.replay, {"clock": "sun", "scan_topic": "/front"}, r"(clock) is 'sun': choose from (\w+)"),
-    "pose": (prim.replay, {"pose": "best", "scan_topic": "/front"}, r"(pose) is 'best': choose from (\w+)"),
-    "sweep": (prim.replay, {"sweep": "up", "scan_topic": "/front"}, r"(sweep) is 'up': choose from (\w+)"),
-    "mapper": (prim.replay, {"mapper": "magic", "scan_topic": "/front"}, r"no (mapper) 'magic': choose from (\w+)"),
-    "sensor_model": (
-        prim.replay,
-        {"sensor_model": "x", "mapper": "prob", "scan_topic": "/front"},
-        r"no sensor model 'x': choose from ()(\w+)",
-    ),
+ONE = {"scan_topic": "/front"}
+CALLS: dict[str, tuple[dict[str, object], str]] = {
+    "scan_topic": ({}, r"choose one with scan_topic ([^ ,]+)"),
+    "clock": ({"clock": "sun", **ONE}, r"clock is 'sun': choose from (\w+)"),
+    "pose": ({"pose": "best", **ONE}, r"pose is 'best': choose from (\w+)"),
+    "sweep": ({"sweep": "up", **ONE}, r"sweep is 'up': choose from (\w+)"),
+    "mapper": ({"mapper": "magic", **ONE}, r"no mapper 'magic': choose from (\w+)"),
+    "sensor_model": ({"sensor_model": "x", "mapper": "prob", **ONE}, r"no sensor model 'x': choose from (\w+)"),
 }
+"""By the parameter that is suggested: parameters of a replay of two scanners, and the message with its value."""
 
 
 @pytest.mark.parametrize("name", CALLS)
 def test_what_the_api_suggests_helps(name: str, in_tmp: Path) -> None:
-    call, given, pattern = CALLS[name]
+    given, pattern = CALLS[name]
     log = write("a.mcap", TWO)
-    fixed = {"detect": False, "resolution": 0.05}
+    fixed: dict[str, object] = {"detect": False, "resolution": 0.05}
     with pytest.raises(prim.PrimError) as error:
-        call(log, **fixed, **given)
+        prim.replay(log, **fixed, **given)  # type: ignore[arg-type]
     match = re.search(pattern, str(error.value))
     assert match and "--" not in str(error.value), error.value
-    call(log, **fixed | given | {name: match[2]})
+    prim.replay(log, **fixed | given | {name: match[1]})  # type: ignore[arg-type]
 
 
 def test_keywords_that_are_meant_are_taken(in_tmp: Path) -> None:
@@ -226,6 +241,7 @@ NOT_IN_TABLES = {
     "--debug shows the traceback": "tests/prim/test_console.py",
     "a larger --resolution or a part of the log takes less": "how much memory there is",
     "(try: {} --help)": ABOVE,
+    "m is too large to drive on: give": ABOVE,
     "change to another one": USERS,
     "choose another place": USERS,
     "give the output another name": USERS,
