@@ -177,7 +177,9 @@ def _frames(log: LogSource, topic: Topic) -> Iterator[str]:
             edges[parent].append(child)
         yield from (f"{parent} > {child}" for parent in edges for child in edges[parent])
     elif topic.content is not None and topic.content is not Content.PRIMITIVES:
-        _, value = next(iter(log.decoded(topic)))
+        value = next((value for _, value in log.decoded(topic) if value != []), None)
+        if value is None:  # none of its messages can be decoded
+            return
         message = value[0] if isinstance(value, list) else value
         names = (message.frame_id, getattr(message, "child_frame_id", ""))
         yield " > ".join(name or "(no name)" for name in names[: 2 if names[1] else 1])

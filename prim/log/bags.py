@@ -8,7 +8,6 @@ from contextlib import contextmanager
 from itertools import pairwise
 from pathlib import Path
 
-import numpy as np
 from rosbags.rosbag1 import Reader
 
 from prim.errors import LogReadError
@@ -18,7 +17,7 @@ from prim.log.log_file import LogFile
 from prim.log.reader import LogReader, ros2_name
 from prim.log.recovery import RECOVER_HINT
 from prim.log.source import Message, Topic
-from prim.log.time_resets import MIN_RESET, find_shifts, moved_behind_resets, reset_notes
+from prim.log.time_resets import MIN_RESET, as_stamps, find_shifts, moved_behind_resets, reset_notes
 
 ENCODING = "ros1"
 
@@ -64,7 +63,7 @@ class Ros1BagReader(LogReader):
         if scans is None or not any(b.start_time < a.end_time - MIN_RESET for a, b in pairwise(chunks)):
             return (0,)
         times = [message.log_time for message in self._written_messages() if message.topic == scans]
-        return find_shifts(np.array(times, dtype=np.int64))
+        return find_shifts(as_stamps(times))
 
     def _written_messages(self) -> Iterator[Message]:
         """Yield all messages in the order in which they were written."""
@@ -104,7 +103,7 @@ class RecoveredBagReader(LogReader):
                 times.setdefault(topic, []).append(log_time)
         self._unread = max(self._records.expected - counts.total(), 0)
         self.topics = _topics_of((topic, kind, count) for (topic, kind), count in counts.items())
-        self._shifts = find_shifts(np.array(next(iter(times.values()), []), dtype=np.int64))
+        self._shifts = find_shifts(as_stamps(next(iter(times.values()), [])))
         self.notes = reset_notes(self._shifts)
 
     def close(self) -> None:

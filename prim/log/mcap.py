@@ -29,7 +29,7 @@ from prim.log.log_file import LogFile
 from prim.log.reader import LogReader, ros2_name
 from prim.log.recovery import RECORD_LIMIT, RECOVER_HINT, RecordReader, read_chunk, translated_errors
 from prim.log.source import Message, Topic
-from prim.log.time_resets import find_shifts, moved_behind_resets, reset_notes
+from prim.log.time_resets import as_stamps, find_shifts, moved_behind_resets, reset_notes
 
 MAGIC = b"\x89MCAP0\r\n"
 
@@ -136,8 +136,11 @@ class McapReader(LogReader):
         if len(self._shifts) > 1:
             yield from moved_behind_resets(self._unindexed_messages(topics), self._shifts)
             return
-        if self._recover or self._summary is None or not self._summary.chunk_indexes:
+        if self._recover:
             yield from self._unindexed_messages(topics)
+            return
+        if self._summary is None or not self._summary.chunk_indexes:
+            yield from self._sorted_messages(topics)
             return
         delivered: Counter[str] = Counter()
         with translated_errors(self.path):
@@ -185,7 +188,7 @@ class McapReader(LogReader):
         if self._recover or self._summary is None or not self._summary.chunk_indexes:
             name = self._contents.channels[min(scans)].topic
             times = [message.log_time for message in self._unindexed_messages((name,))]
-            shifts = find_shifts(np.array(times, dtype=np.int64))
+            shifts = find_shifts(as_stamps(times))
         else:
             with translated_errors(self.path):
                 parts = list(self._written_times(self._summary, min(scans)))
@@ -204,6 +207,13 @@ class McapReader(LogReader):
                 if opcode != Opcode.MESSAGE_INDEX:
                     raise McapError(f"no index of messages at byte {at}")
                 yield entries[np.argsort(entries[:, 1], kind="stable"), 0].astype(np.int64)
+
+    def _sorted_messages(self, topics: tuple[str, ...]) -> Iterator[Message]:
+        """Yield messages without an index by log time: those of a log in another order are all read at first."""
+        times = (message.log_time for message in self._unindexed_messages(topics))
+        if all(earlier <= later for earlier, later in pairwise(times)):
+            return self._unindexed_messages(topics)
+        return iter(sorted(self._unindexed_messages(topics), key=lambda message: message.log_time))
 
     def _unindexed_messages(self, topics: tuple[str, ...]) -> Iterator[Message]:
         names = {number: channel.topic for number, channel in self._contents.channels.items()}

@@ -7,7 +7,6 @@ from collections.abc import Callable, Container, Iterator, Mapping
 from pathlib import Path
 from typing import ClassVar, Self
 
-import numpy as np
 import zstandard
 
 from prim.arrays import Stamps
@@ -15,6 +14,7 @@ from prim.errors import LogReadError
 from prim.log.decoding.codecs import Codec, Content, codec_of
 from prim.log.log_file import ZSTD_MAGIC, LogFile
 from prim.log.source import Message, Numbered, Topic
+from prim.log.time_resets import LATEST, as_stamps
 
 MESSAGE_LIMIT = 1 << 30
 """Messages of readable logs are no larger (bytes)."""
@@ -65,7 +65,7 @@ class LogReader(ABC):
 
     def log_times(self, topic: str) -> Stamps:
         """Return when the messages of a topic were logged (N,) in ns. Raises LogReadError."""
-        return np.array([message.log_time for message in self.messages(topic)], dtype=np.int64)
+        return as_stamps(message.log_time for message in self.messages(topic))
 
     @property
     def messages_lost(self) -> int | None:
@@ -108,6 +108,9 @@ class LogReader(ABC):
         """Yield numbers, topics, log times and decoded messages; plain tuples, since scans are most of a log."""
         for number, (name, log_time, data) in enumerate(self.messages(*decoders)):
             if wanted is not None and number not in wanted:
+                continue
+            if log_time >= LATEST:
+                self._reject(name, number, ValueError(f"it was logged at {log_time / 1e9:g} s, beyond all times"))
                 continue
             decode = decoders[name]
             try:

@@ -11,8 +11,6 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from prim.arrays import Stamps
 from prim.errors import LogReadError
 from prim.log.decoding.codecs import SCAN_CONTENTS, content_of
@@ -20,13 +18,16 @@ from prim.log.log_file import LogFile
 from prim.log.reader import LogReader
 from prim.log.recovery import RECOVER_HINT
 from prim.log.source import Message, Topic
-from prim.log.time_resets import find_shifts, moved_behind_resets, reset_notes
+from prim.log.time_resets import as_stamps, find_shifts, moved_behind_resets, reset_notes
 
 PENDING = ("-wal", "-journal")
 """What SQLite appends to the name of a file for one with changes that are still to be made: of a killed recorder."""
 
 MAX_STEP = 1 << 40
 """Behind damage, messages are searched for this far on (rows)."""
+
+MAX_ROW = 1 << 62
+"""Rows are numbered no higher, unless they are damaged."""
 
 
 class SqliteBagReader(LogReader):
@@ -116,7 +117,7 @@ class SqliteBagReader(LogReader):
             with _translated_errors(self.path, RECOVER_HINT):
                 query = f"SELECT {columns} FROM messages WHERE {where} ORDER BY rowid"
                 times = [time for (time,) in self._base.execute(query)]
-        return find_shifts(np.array(times, dtype=np.int64))
+        return find_shifts(as_stamps(times))
 
     def log_times(self, topic: str) -> Stamps:
         """See :meth:`prim.log.reader.LogReader.log_times`: without reading the messages."""
@@ -127,7 +128,7 @@ class SqliteBagReader(LogReader):
             f"SELECT timestamp FROM messages WHERE topic_id IN ({', '.join('?' * len(numbers))}) ORDER BY timestamp"
         )
         with _translated_errors(self.path, RECOVER_HINT):
-            return np.array([time for (time,) in self._base.execute(query, numbers)], dtype=np.int64)
+            return as_stamps(time for (time,) in self._base.execute(query, numbers))
 
     def messages(self, *topics: str) -> Iterator[Message]:
         """See :meth:`prim.log.source.LogSource.messages`; a log that is recovered is read in the order of writing."""
@@ -151,9 +152,11 @@ class SqliteBagReader(LogReader):
         """Yield rowid and columns of the messages of these topics (none: of all) as written, past what is damaged."""
         query = f"SELECT topic_id, rowid, {columns} FROM messages WHERE rowid > ? ORDER BY rowid LIMIT ?"
         at, step, limit = -1, 0, -1
-        while step < MAX_STEP:
+        while step < MAX_STEP and at < MAX_ROW:
             try:
                 for number, *row in self._base.execute(query, (at, limit)):
+                    if row[0] <= at:
+                        raise sqlite3.DatabaseError("its pages do not fit together")
                     at, step = row[0], 0
                     if not numbers or number in numbers:
                         yield tuple(row)

@@ -20,6 +20,15 @@ GAP = 100_000_000
 """What comes after a reset is put so long (ns) behind what was before; set by hand."""
 
 
+LATEST = 1 << 62
+"""Times (ns) from here on are damage."""
+
+
+def as_stamps(times: Iterable[int]) -> Stamps:
+    """Return times (ns) as an array (N,); those that are beyond all times as LATEST."""
+    return np.array([min(time, LATEST) for time in times], dtype=np.int64)
+
+
 def find_shifts(log_times: Stamps) -> tuple[int, ...]:
     """Find out by how much log times are to be moved after each reset, so that they rise.
 

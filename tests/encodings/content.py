@@ -13,6 +13,7 @@ from prim.log.messages import (
     BASE_FRAME,
     LASER_FRAME,
     TF_STATIC_TOPIC,
+    TF_TYPE,
     TRUE_POSE_TOPIC,
     TRUE_PRIMITIVES_TOPIC,
     encode_transforms,
@@ -84,7 +85,8 @@ def remounted(content: LogContent, mount: Pose2D) -> LogContent:
     def moved(message: Message) -> Message:
         if message.topic != TF_STATIC_TOPIC:
             return message
-        return message._replace(data=encode_transforms([(0, BASE_FRAME, LASER_FRAME, mount)]))
+        stamp = decode_poses(TF_TYPE, message.data)[0].stamp
+        return message._replace(data=encode_transforms([(stamp, BASE_FRAME, LASER_FRAME, mount)]))
 
     return replace(content, messages=tuple(map(moved, content.messages)))
 

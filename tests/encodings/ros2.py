@@ -32,7 +32,18 @@ SPLITS = 3
 MANY_SPLITS = 11
 """More than ten: the names of the parts are then not in the order of the parts."""
 
-_LATCHED_QOS = "- history: 1\n  depth: 1\n  reliability: 1\n  durability: 1\n"
+_ENDLESS = "{sec: 9223372036, nsec: 854775807}"
+_LATCHED_QOS = f"""\
+- history: 1
+  depth: 1
+  reliability: 1
+  durability: 1
+  deadline: {_ENDLESS}
+  lifespan: {_ENDLESS}
+  liveliness: 1
+  liveliness_lease_duration: {_ENDLESS}
+  avoid_ros_namespace_conventions: false
+"""
 
 
 def mcap_bytes(content: LogContent, compress_messages: bool = False, **options: Any) -> bytes:
@@ -193,7 +204,8 @@ def write_db3_foxy(content: LogContent, folder: Path) -> Path:
     )
     base.execute("CREATE INDEX timestamp_idx ON messages (timestamp ASC)")
     numbers = {topic: number for number, topic in enumerate(content.types, 1)}
-    rows = [(numbers[topic], topic, kind, "cdr", "") for topic, kind in content.types.items()]
+    qos = {topic: _LATCHED_QOS if topic in LATCHED else "" for topic in content.types}
+    rows = [(numbers[topic], topic, kind, "cdr", qos[topic]) for topic, kind in content.types.items()]
     base.executemany("INSERT INTO topics VALUES(?, ?, ?, ?, ?)", rows)
     messages = [(numbers[topic], log_time, data) for topic, log_time, data in content.messages]
     base.executemany("INSERT INTO messages(topic_id, timestamp, data) VALUES(?, ?, ?)", messages)

@@ -49,6 +49,8 @@ ENCODINGS = [
             "mcap-unindexed": ros2.write_mcap_unindexed,
             "mcap-unindexed-unchunked": ros2.write_mcap_unindexed_unchunked,
             "mcap-unsorted": _unsorted(ros2.write_mcap),
+            "mcap-unsorted-unchunked": _unsorted(ros2.write_mcap_unchunked),
+            "mcap-unsorted-unindexed": _unsorted(ros2.write_mcap_unindexed),
             "mcap-zstd-messages": ros2.write_mcap_zstd_messages,
             "mcap.zst": ros2.write_mcap_zst,
             "mcap.zstd": ros2.write_mcap_zstd,

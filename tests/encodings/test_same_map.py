@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from functools import cache
 from pathlib import Path
@@ -14,8 +15,9 @@ import prim
 from prim.log.decoding.ros import decode_scan
 from prim.log.messages import SCAN_TOPIC
 from prim.scan import RangeOutcome
-from tests.encodings import ros2
-from tests.encodings.content import LogContent, without_truth
+from prim.se2 import Pose2D
+from tests.encodings import carmen, ros2
+from tests.encodings.content import LogContent, remounted, without_truth
 from tests.encodings.table import ENCODINGS, Encoding, Reduction, everything
 
 OPTIONS: dict[str, Any] = {"mapper": "forward", "resolution": 0.02}
@@ -54,6 +56,26 @@ def comparable(report: dict[str, Any]) -> dict[str, Any]:
     """Return a report without path, format and times."""
     log = {key: value for key, value in report["log"].items() if key not in ("path", "format")}
     return {**{key: value for key, value in report.items() if key != "timing"}, "log": log}
+
+
+@pytest.mark.parametrize(
+    ("write", "mount"),
+    [
+        (carmen.write_flaser, Pose2D(0.1, 0.02, 0.0)),
+        (carmen.write_rlaser, Pose2D(-0.1, 0.0, math.pi)),
+        (carmen.write_robotlaser, Pose2D(0.1, 0.0, 0.3)),
+    ],
+    ids=["flaser", "rlaser", "robotlaser"],
+)
+def test_carmen_tells_where_the_laser_is_on_the_robot(
+    content: LogContent, tmp_path: Path, write: Callable[[LogContent, Path], Path], mount: Pose2D
+) -> None:
+    """By two poses of six decimals: the mount is known to micrometres, the trajectory is as good."""
+    session = remounted(content, mount)
+    reference = ros2.write_mcap(carmen.reduce_to_carmen(session), tmp_path)
+    poses, expected = (prim.replay(path, **OPTIONS).poses for path in (write(session, tmp_path), reference))
+    assert np.array_equal(poses.stamps, expected.stamps)
+    assert poses.poses == pytest.approx(expected.poses, abs=2e-6)
 
 
 def test_the_session_shows_what_encodings_lose(content: LogContent, reduced: Replay) -> None:

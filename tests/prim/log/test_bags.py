@@ -194,3 +194,14 @@ def test_times_in_another_order_are_not_set_back(tmp_path: Path) -> None:
     for write in (ros1.write_bag, ros2.write_db3_foxy, ros2.write_mcap):
         with open_log(write(LogContent(content.types, messages, {}, {}), tmp_path)) as log:
             assert not log.notes
+
+
+@pytest.mark.parametrize("write", [ros2.write_mcap, ros2.write_mcap_unchunked])
+def test_a_message_that_was_logged_beyond_all_times_is_damage(tmp_path: Path, write: Write) -> None:
+    content = small_log(4)
+    messages = tuple(m._replace(log_time=(1 << 64) - 1) if k == 3 else m for k, m in enumerate(content.messages))
+    path = write(LogContent(content.types, messages, {}, {}), tmp_path)
+    with open_log(path) as log, pytest.raises(LogReadError, match=r"beyond all times"):
+        list(log.numbered(*log.topics.values()))
+    with open_log(path, recover=True) as log:
+        assert len(list(log.numbered(*log.topics.values()))) == len(messages) - 1
