@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import difflib
+import math
 import re
 from collections.abc import Collection, Iterator, Mapping
 from contextlib import contextmanager
@@ -17,8 +18,12 @@ if TYPE_CHECKING:
 
 _FLAG = re.compile(r"(?<![\w./-])--([a-z][a-z0-9-]*)")
 
-_ANGLES = {" X Y DEG": " (x, y, radians)"}
-"""What stands behind an option of the command line, and behind the parameter."""
+_RENAMED = {"slice": "height_slice"}
+"""Parameters that are called otherwise than their options, by these: Python has a ``slice`` of its own."""
+
+_NUMBER = r"[-+]?[0-9.]+(?:e[-+]?[0-9]+)?"
+_OFFSET = re.compile(rf"--laser-offset (?:X Y DEG|({_NUMBER}) ({_NUMBER}) ({_NUMBER}))")
+"""The option whose angle is in degrees, with what stands behind it."""
 
 
 def checked_path(name: str, value: object) -> Path:
@@ -119,16 +124,20 @@ def name_parameters(text: str, parameters: Collection[str], switches: Collection
     """
 
     def parameter(match: re.Match[str]) -> str:
-        name = match[1].replace("-", "_")
+        name = _RENAMED.get(match[1], match[1].replace("-", "_"))
         if name in switches:
             return f"{name}=True"
         if name.removeprefix("no_") in switches:
             return f"{name.removeprefix('no_')}=False"
         return name if name in parameters else match[0]
 
-    for option, value in _ANGLES.items():
-        text = text.replace(option, value)
-    return _FLAG.sub(parameter, text)
+    def offset(match: re.Match[str]) -> str:
+        if match[1] is None:
+            return "--laser-offset (x, y, radians)"
+        x, y, degrees = map(float, match.groups())
+        return f"--laser-offset ({x:g}, {y:g}, {math.radians(degrees):.5g})"
+
+    return _FLAG.sub(parameter, _OFFSET.sub(offset, text))
 
 
 @contextmanager

@@ -13,6 +13,7 @@ from prim.errors import UsageError
 from prim.se2 import Pose2D, wrap_angle
 from prim.world import World
 from recorder.simulator import Simulator
+from recorder.world import WorldOptions
 
 Cell = tuple[int, int]
 """Row and column of a cell of the explorer's grid."""
@@ -68,6 +69,8 @@ class ExplorerOptions:
 
 
 DEFAULTS = ExplorerOptions()
+USUAL_FLOOR = WorldOptions().size
+"""The floor (m) of a session by default, which leaves the robot room."""
 
 
 def warp(simulator: Simulator, rng: np.random.Generator, stops: tuple[int, int] = (10, 10)) -> Iterator[Step]:
@@ -163,7 +166,11 @@ class Explorer:
         """
         self._free = _largest_component(self._free)
         if not self._free:
-            raise UsageError("the robot finds no room to drive: give a larger --size or fewer primitives")
+            x0, y0, x1, y1 = self._simulator.world.bounds
+            larger = " ".join(f"{max(2 * side, max(USUAL_FLOOR)):g}" for side in (x1 - x0, y1 - y0))
+            raise UsageError(
+                f"the robot finds no room to drive: give --size {larger} or fewer primitives, or a roomier --world"
+            )
         cells = sorted(self._free)
         for index in self._rng.permutation(len(cells)):
             pose = Pose2D(*self._centre(cells[index]), self._rng.uniform(-math.pi, math.pi))
@@ -239,8 +246,11 @@ class Explorer:
         rows = range(math.floor(y0 / cell), math.ceil(y1 / cell))
         cols = range(math.floor(x0 / cell), math.ceil(x1 / cell))
         if len(rows) * len(cols) > self._options.max_cells:
+            longest = (math.isqrt(self._options.max_cells) - 2) * cell  # two cells reach beyond the edges
+            smaller = " ".join(f"{min(side, longest):g}" for side in (x1 - x0, y1 - y0))
             raise UsageError(
-                f"a floor of {x1 - x0:g} x {y1 - y0:g} m is too large to drive on: give a smaller --size"
+                f"a floor of {x1 - x0:g} x {y1 - y0:g} m is too large to drive on: give --size {smaller} or less, "
+                "or a smaller --world"
             )
         return {(row, col) for row in rows for col in cols if self._has_room(*self._centre((row, col)))}
 

@@ -49,6 +49,9 @@ class PlacementOptions:
 
 DEFAULTS = PlacementOptions()
 
+AMPLE_SPACING = 0.6
+"""Primitives that have squares of this side (m) on average find places; set by hand."""
+
 
 def draw_world(rng: np.random.Generator, options: WorldOptions, placement: PlacementOptions = DEFAULTS) -> World:
     """Draw a world.
@@ -76,8 +79,15 @@ def draw_world(rng: np.random.Generator, options: WorldOptions, placement: Place
             width, height = options.size
             raise UsageError(
                 f"{most} of each of {len(options.kinds)} kinds do not fit on {width:g} x {height:g} m: "
-                "give a larger --size or a smaller --per-kind"
+                f"give {_larger_floor(options)} or a smaller --per-kind"
             )
+
+
+def _larger_floor(options: WorldOptions) -> str:
+    """Return the option that makes the floor, enlarged in its form, large enough for all primitives."""
+    width, height = options.size
+    growth = AMPLE_SPACING * math.sqrt(options.per_kind[1] * len(options.kinds) / (width * height))
+    return "--size " + " ".join(f"{math.ceil(max(growth * side, AMPLE_SPACING, side))}" for side in options.size)
 
 
 def _place(

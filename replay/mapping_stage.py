@@ -122,7 +122,7 @@ class MappingStage:
             return [
                 f"{self.usage.far} of {self.usage.hits} rays that returned from a surface are longer than "
                 f"{self.usage.longest:.0f} m ({MAX_STEPS:.0f} cells): where they end is not on the map; "
-                f"give --max-range {self.usage.longest:.0f}, or if that is right a coarser --resolution"
+                f"give --max-range {math.floor(self.usage.longest)}, or if that is right a coarser --resolution"
             ]
         if not (grid.free | grid.occupied).any():
             return ["no ray crosses the map's bounds: all of it is unknown"]

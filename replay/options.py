@@ -119,7 +119,8 @@ class ReplayOptions:
             raise UsageError(f"--clock is {self.clock!r}: choose from {', '.join(ClockName)}")
         lowest, highest = self.height_slice or (0.0, 1.0)
         if not -math.inf < lowest < highest < math.inf:
-            raise UsageError(f"--slice is {lowest:g} {highest:g}: give two heights, the lower first")
+            other_way = f": --slice {highest:g} {lowest:g}" if -math.inf < highest < lowest < math.inf else ""
+            raise UsageError(f"--slice is {lowest:g} {highest:g}: give two heights, the lower first{other_way}")
         if self.sweep not in [*SweepName]:
             raise UsageError(f"--sweep is {self.sweep!r}: choose from {', '.join(SweepName)}")
         if not self.deskew and self.sweep != SweepName.AUTO:

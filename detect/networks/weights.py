@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shlex
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -132,7 +133,9 @@ def load_weights(path: Path, stage: str, mapper: str | None = None, threads: int
     except OSError as error:
         raise WeightsError(f"{path}: {error.strerror or error}") from error
     if content.startswith(PICKLE_PREFIXES):
-        raise WeightsError(f"{path} is a pickle, which can run code: make an ONNX file of it with prim-train export")
+        places = " ".join(shlex.quote(str(place)) for place in (path, path.with_suffix(".onnx")))
+        export = f"prim-train export {places} --stage {stage}{f' --mapper {mapper}' if mapper else ''}"
+        raise WeightsError(f"{path} is a pickle, which can run code: make an ONNX file of it with: {export}")
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = threads or len(os.sched_getaffinity(0))
     # Threads that spin while they wait for work take the cores from whatever else runs.

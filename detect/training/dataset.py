@@ -16,6 +16,7 @@ interrupted run can be continued. In ``detect`` only training and evaluation use
 from __future__ import annotations
 
 import re
+import shlex
 import tempfile
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import as_completed
@@ -489,8 +490,25 @@ def load_samples(folder: Path, mapper: str, split: str) -> list[Sample]:
     """
     paths = sorted((folder / "truth" / split).glob("*.json"))
     if not paths or not (folder / f"{mapper}.yaml").exists():
-        raise UsageError(f"{folder} holds no {split} set for {mapper}: make one with prim-train dataset")
+        raise UsageError(f"{folder} holds no {split} set for {mapper}: {hint_to_make_set(folder, mapper)}")
     return [_read_sample(folder, mapper, split, path) for path in paths]
+
+
+def hint_to_make_set(folder: Path, mapper: str) -> str:
+    """Return the command that makes a set for a mapper.
+
+    Args:
+        folder: The folder that lacks it; where it holds another set, one beside it is named.
+        mapper: Name of the mapper, or «drawings».
+
+    Returns:
+        The hint.
+    """
+    place = folder.with_name(f"{folder.name}-{mapper}") if (folder / "manifest.json").exists() else folder
+    command = f"dataset {shlex.quote(str(place))} --mapper {mapper}"
+    if mapper not in MAPPERS:
+        command = f"{mapper} {shlex.quote(str(place))}"
+    return f"make one with: prim-train {command}"
 
 
 def image_style(folder: Path, mapper: str) -> str:
@@ -510,7 +528,7 @@ def image_style(folder: Path, mapper: str) -> str:
         manifest = strict_json.loads((folder / "manifest.json").read_bytes())
         return "rounded" if mapper in manifest.get("rounded", ()) else "grey"
     except (OSError, ValueError, TypeError, AttributeError) as error:
-        raise UsageError(f"{folder} holds no set: make one with prim-train dataset") from error
+        raise UsageError(f"{folder} holds no set: {hint_to_make_set(folder, mapper)}") from error
 
 
 def _read_sample(folder: Path, mapper: str, split: str, path: Path) -> Sample:

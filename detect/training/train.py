@@ -20,7 +20,7 @@ import torch
 
 from detect.networks.parameters import PAPER, PRESETS, PRIM, encode_parameters
 from detect.training.crops import CropSamples, collect_crops
-from detect.training.dataset import data_description, image_style, load_samples, read_image
+from detect.training.dataset import data_description, hint_to_make_set, image_style, load_samples, read_image
 from detect.training.export import import_cnn, import_yolo
 from detect.training.model import ParameterNetwork
 from detect.training.offline import load_ultralytics
@@ -376,7 +376,7 @@ def train_yolo(data: Path, mapper: str, output: Path, options: YoloOptions) -> P
             interrupted and is not trusted.
     """
     if not (data / f"{mapper}.yaml").exists():
-        raise UsageError(f"{data} holds no set for {mapper}: make one with prim-train dataset")
+        raise UsageError(f"{data} holds no set for {mapper}: {hint_to_make_set(data, mapper)}")
     _claim_folder(output, {"mapper": mapper, "set": _manifest(data), "options": _plain(asdict(options))})
     best, last = (output / "weights" / name for name in ("best.pt", "last.pt"))
     if (output / FINISHED_MARKER).exists():

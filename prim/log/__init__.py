@@ -121,9 +121,9 @@ _UNSUPPORTED = {
     b"RRF2": ("a rerun recording", "open it with: rerun {}"),
     b"#ROSBAG V1": ("a ROS 1 bag of the old format 1.2", "convert it with: rosbag fix {0} {0}.v2.bag"),
     b"PK\x03\x04": ("a ZIP archive", "unpack it with: unzip {}"),
-    b"BZh": ("compressed by bzip2", "unpack it with: bunzip2 --keep {}"),
-    b"\xfd7zXZ\0": ("compressed by xz", "unpack it with: unxz --keep {}"),
-    b"\x04\x22\x4d\x18": ("compressed by lz4", "unpack it with: unlz4 {}"),
+    b"BZh": ("compressed by bzip2", "unpack it with: bzip2 -dc {0} > {0}.unpacked"),
+    b"\xfd7zXZ\0": ("compressed by xz", "unpack it with: xz -dc {0} > {0}.unpacked"),
+    b"\x04\x22\x4d\x18": ("compressed by lz4", "unpack it with: lz4 -dc {0} > {0}.unpacked"),
 }
 """First bytes of files that cannot be read, what they are, and what to do."""
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 import stat
 import tempfile
 import zlib
@@ -112,7 +113,9 @@ class LogFile:
         layers: list[str] = []
         while (compression := _compression(self.head)) is not None:
             if len(layers) == MAX_LAYERS:
-                raise LogReadError(self.path, f"compressed more than {MAX_LAYERS} times", "unpack it first")
+                quoted = shlex.quote(str(self.path))
+                hint = f"unpack it with: {layers[0]} -dc {quoted} > {quoted}.unpacked"
+                raise LogReadError(self.path, f"compressed more than {MAX_LAYERS} times", hint)
             name, unpacked = compression
             self._unpack(name, unpacked, len(layers), recover)
             layers.append(name)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import shlex
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
@@ -52,7 +53,9 @@ def files_of_bag(folder: Path) -> list[Path]:
         raise LogReadError(folder, "a folder without a log in it", "give a log, or the folder of a ROS 2 bag")
     if len(found) > 1 and len({_part_number(path)[0] for path in found}) > 1:
         names = ", ".join(path.name for path in found)
-        raise LogReadError(folder, f"a folder with {len(found)} logs ({names})", f"give one of them: {found[0]}")
+        raise LogReadError(
+            folder, f"a folder with {len(found)} logs ({names})", f"give one of them: {shlex.quote(str(found[0]))}"
+        )
     return found
 
 
@@ -71,7 +74,8 @@ def notes_on_part(path: Path) -> list[str]:
     which = (
         f"{path.name} is part {names.index(path.name) + 1} of {len(names)} of a bag, whose other parts are not read"
     )
-    return [f"{which} (static transforms, for one, may be in the first): for all give {path.absolute().parent}"]
+    folder = shlex.quote(str(path.absolute().parent))
+    return [f"{which} (static transforms, for one, may be in the first): for all give {folder}"]
 
 
 def notes_on_unlisted(folder: Path, files: Sequence[Path]) -> list[str]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import shlex
 from functools import cached_property
 from typing import NamedTuple
 
@@ -189,7 +190,9 @@ class SensorMounts:
     def check_offset(self, scans: ScanTimes) -> None:
         """Check that an offset that is given is that of one laser. Raises UsageError."""
         if self.offset is not None and len(scans.frame_ids) > 1:
-            raise UsageError(f"--laser-offset goes with one scanner: give --scan-topic {scans.topics[0]}")
+            raise UsageError(
+                f"--laser-offset goes with one scanner: give --scan-topic {shlex.quote(scans.topics[0])}"
+            )
 
     def _mounted_frame(self, name: str, base: str) -> tuple[str, tuple[str, ...]]:
         """Return a scanner's frame; where tf has no chain from it to the robot, the one that alone can be it."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from typing import NamedTuple
@@ -237,7 +238,9 @@ class PoseProvider:
         roots = sorted({origin.split(" > ")[0] for origin in origins})
         if len(roots) > 1:
             what = f"tf has the scanners in different fixed frames ({', '.join(roots)})"
-            raise LogReadError(self._log.path, what, f"choose one scanner with --scan-topic {scans.topics[0]}")
+            raise LogReadError(
+                self._log.path, what, f"choose one scanner with --scan-topic {shlex.quote(scans.topics[0])}"
+            )
         notes += tuple(f"{frame} has several parents in tf: {parent} is used" for frame, parent in tree.conflicts)
         unique = tuple(dict.fromkeys(notes))
         origin = ", ".join(origins)

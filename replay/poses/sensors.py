@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import re
+import shlex
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 
@@ -158,7 +159,7 @@ def find_pose_topic(log: LogSource, requested: str | None = None) -> Topic | Non
     odometry = [topic for topic in topics if topic.content is Content.ODOMETRY] or topics
     if len(odometry) > 1:
         what = f"poses on {len(odometry)} topics: {', '.join(topic.name for topic in odometry)}"
-        raise LogReadError(log.path, what, f"choose one with --odom-topic {odometry[0].name}")
+        raise LogReadError(log.path, what, f"choose one with --odom-topic {shlex.quote(odometry[0].name)}")
     return odometry[0] if odometry else None
 
 
@@ -258,7 +259,9 @@ def _find(
     if len(likely) > 1:
         listed = ", ".join(topic.name for topic in likely)
         raise LogReadError(
-            log.path, f"{len(likely)} topics to choose from: {listed}", f"choose one with {option} {likely[0].name}"
+            log.path,
+            f"{len(likely)} topics to choose from: {listed}",
+            f"choose one with {option} {shlex.quote(likely[0].name)}",
         )
     return likely[0] if likely else None
 

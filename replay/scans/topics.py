@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Sequence
 from itertools import pairwise
 
@@ -37,8 +38,8 @@ def choose_scan_topics(log: LogSource, wanted: Sequence[str]) -> tuple[list[Topi
         note = (
             f"{len(topics)} scanners of one robot are mapped together ({names}); for one of them give --scan-topic "
         )
-        return topics, (note + topics[0].name,)
-    hint = f"choose one with --scan-topic {topics[0].name}, or more by giving it again"
+        return topics, (note + shlex.quote(topics[0].name),)
+    hint = f"choose one with --scan-topic {shlex.quote(topics[0].name)}, or more by giving it again"
     raise LogReadError(log.path, f"{len(topics)} scan topics: {names}", hint)
 
 

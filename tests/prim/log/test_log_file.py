@@ -106,8 +106,8 @@ def tar(data: bytes) -> bytes:
 @pytest.mark.parametrize(
     ("pack", "what"),
     [
-        (bz2.compress, "bzip2, not a log; unpack it with: bunzip2"),
-        (lzma.compress, "xz, not a log; unpack it with: unxz"),
+        (bz2.compress, "bzip2, not a log; unpack it with: bzip2 -dc"),
+        (lzma.compress, "xz, not a log; unpack it with: xz -dc"),
         (tar, "a tar archive, not a log; unpack it with: tar -xf"),
         (lambda data: gzip.compress(tar(data)), "a tar archive, not a log"),
     ],
