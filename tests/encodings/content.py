@@ -65,7 +65,7 @@ def delayed(content: LogContent) -> LogContent:
 
 
 def without_truth(content: LogContent) -> LogContent:
-    """Leave out all that tells where the robot and the primitives really were."""
+    """Leave out all that says where the robot and the primitives really were."""
     return without_records(_without(content, TRUE_POSE_TOPIC, TRUE_PRIMITIVES_TOPIC))
 
 
