@@ -40,7 +40,7 @@ class Stage:
 SCAN = (
     Stage(
         "Open the log",
-        (("prim/log/__init__.py", "open_log"), ("prim/log/mcap.py", "McapReader")),
+        (("prim/log/__init__.py", "open_log"), ("prim/log/mcap/reader.py", "McapReader")),
         "LogSource",
     ),
     Stage(

@@ -64,14 +64,17 @@ def _open_file(path: Path, recover: bool) -> LogReader:
 
     file = LogFile(path, recover)
     try:
-        return _opener(file)(file, recover)
+        return _opener(file, recover)(file, recover)
     except BaseException:
         file.close()
         raise
 
 
-def _opener(file: LogFile) -> Callable[[LogFile, bool], LogReader]:
-    """Return what opens a log of this content. Raises LogReadError."""
+def _opener(file: LogFile, recover: bool) -> Callable[[LogFile, bool], LogReader]:
+    """Return what opens a log of this content; to recover one whose start is damaged, its name counts.
+
+    Raises LogReadError.
+    """
     for magic, open_source in _SOURCES.items():
         if file.head.startswith(magic):
             return open_source
@@ -88,11 +91,13 @@ def _opener(file: LogFile) -> Callable[[LogFile, bool], LogReader]:
 
     if carmen.START.match(file.head):
         return carmen.CarmenReader
+    if recover and ".mcap" in file.path.name:
+        return _open_mcap
     raise LogReadError(file.path, "not a log of a known format: it begins with other bytes", _KNOWN)
 
 
 def _open_mcap(file: LogFile, recover: bool) -> LogReader:
-    from prim.log.mcap import McapReader  # when it is needed: writing a log does without it
+    from prim.log.mcap.reader import McapReader  # when it is needed: writing a log does without it
 
     return McapReader(file, recover)
 

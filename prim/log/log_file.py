@@ -86,6 +86,7 @@ class LogFile:
         compression: «zstd» or «gzip»; empty where it is not compressed.
         head: The first bytes of ``data``, as many as its format is found by.
         lost: What could not be unpacked.
+        file_bytes: The size of ``path`` (bytes), which what may be unpacked is measured by.
 
     Raises:
         LogReadError: The file cannot be read, is damaged (unless ``recover``), or cannot be unpacked here.
@@ -97,6 +98,7 @@ class LogFile:
         self.lost: list[str] = []
         self._folder: tempfile.TemporaryDirectory[str] | None = None
         self.head = _head(path, path)
+        self.file_bytes = path.stat().st_size
         try:
             self._unpack_all(recover)
         except BaseException:

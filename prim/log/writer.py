@@ -7,10 +7,14 @@ from collections.abc import Mapping
 from contextlib import suppress
 from pathlib import Path
 from types import TracebackType
+from typing import TYPE_CHECKING
 
 from prim.files import OutputFile, ResultFormat, output_errors
 from prim.interrupts import interrupted_run
 from prim.log.messages import message_definition
+
+if TYPE_CHECKING:
+    from mcap.records import Channel, Schema
 
 LIBRARY = "prim"
 """What the header of a recorded log names as its writer."""
@@ -19,7 +23,7 @@ RECORDED_LOG = ResultFormat(
     "a log of prim-record", re.compile(rb"\x89MCAP0\r\n\x01.{8}\x04\0\0\0ros2\x04\0\0\0prim", re.DOTALL)
 )
 
-CHUNK_BYTES, CHUNK_MESSAGES = 256 * 1024, 600
+CHUNK_BYTES, CHUNK_MESSAGES = 64 * 1024, 150
 """A chunk ends when it holds this much; the recorder fills one in a fraction of a second."""
 
 
@@ -27,9 +31,9 @@ class LogWriter:
     """Writes a ROS 2 MCAP log: chunked, zstd, with CRCs.
 
     Until it is closed, the log is a :class:`prim.files.OutputFile` in the making. Every chunk is handed to the
-    operating system when it ends, and chunks are small, so that a recorder that is killed loses the last fraction of
-    a second and the rest can be read with ``--recover``. Where a chunk ends depends on the messages and not on the
-    time, so that the same messages make the same bytes.
+    operating system when it ends, and chunks are small and describe the topics in them, so that a recorder that is
+    killed loses the last fraction of a second and the rest can be read with ``--recover``, whatever else is damaged.
+    Where a chunk ends depends on the messages and not on the time, so that the same messages make the same bytes.
 
     Args:
         path: The log.
@@ -56,7 +60,8 @@ class LogWriter:
 
         self._writer = Writer(self._file, chunk_size=1 << 40, compression=CompressionType.ZSTD, enable_crcs=True)
         self._writer.start(profile="ros2", library=LIBRARY)
-        self._channels: dict[str, int] = {}
+        self._topics: dict[str, tuple[Schema, Channel]] = {}
+        self._defined: set[str] = set()
         self._messages_in_chunk, self._bytes_in_chunk = 0, 0
 
     def __enter__(self) -> LogWriter:
@@ -116,9 +121,14 @@ class LogWriter:
             type_name: The type of its messages.
             latched: Whether its last message reaches late subscribers when the log is played back.
         """
-        schema = self._writer.register_schema(type_name, "ros2msg", message_definition(type_name).encode())
-        profile = _LATCHED_QOS if latched else "[]"
-        self._channels[topic] = self._writer.register_channel(topic, "cdr", schema, {"offered_qos_profiles": profile})
+        from mcap.records import Channel, Schema
+
+        schema = Schema(0, message_definition(type_name).encode(), "ros2msg", type_name)
+        schema.id = self._writer.register_schema(schema.name, schema.encoding, schema.data)
+        channel = Channel(0, topic, "cdr", {"offered_qos_profiles": _LATCHED_QOS if latched else "[]"}, schema.id)
+        channel.id = self._writer.register_channel(topic, channel.message_encoding, schema.id, channel.metadata)
+        self._topics[topic] = schema, channel
+        self._defined.add(topic)
 
     def write(self, topic: str, stamp: int, data: bytes) -> None:
         """Write one message.
@@ -129,16 +139,27 @@ class LogWriter:
             data: The message in CDR.
         """
         with output_errors(self.path):
-            self._writer.add_message(self._channels[topic], stamp, data, stamp)
+            if topic not in self._defined:
+                self._repeat_definition(topic)
+            self._writer.add_message(self._topics[topic][1].id, stamp, data, stamp)
             self._messages_in_chunk += 1
             self._bytes_in_chunk += len(data)
             if self._messages_in_chunk >= CHUNK_MESSAGES or self._bytes_in_chunk >= CHUNK_BYTES:
                 self.flush()
 
+    def _repeat_definition(self, topic: str) -> None:
+        """Describe a topic once more, in the current chunk: it can be read where the first one is damaged."""
+        builder = self._writer._Writer__chunk_builder  # type: ignore[attr-defined]  # nothing public repeats them
+        schema, channel = self._topics[topic]
+        builder.add_schema(schema)
+        builder.add_channel(channel)
+        self._defined.add(topic)
+
     def flush(self) -> None:
         """End the current chunk and hand everything to the operating system."""
         self._writer._Writer__finalize_chunk()  # type: ignore[attr-defined]  # nothing public ends a chunk
         self._file.flush()
+        self._defined.clear()
         self._messages_in_chunk, self._bytes_in_chunk = 0, 0
 
 

@@ -323,7 +323,7 @@ def test_a_truncated_log_is_refused_and_salvaged_with_exit_code_3(replay: Run, n
     assert code == 3
     assert "note: lost: all beyond byte" in err
     log = report_of("cut.prob.report.json")["log"]
-    assert (log["recovered"], log["messages_lost"], log["scans"]) == (True, None, noisy_session.scans)
+    assert (log["recovered"], log["messages_lost"], log["scans"]) == (True, 0, noisy_session.scans)
 
 
 def test_several_mappers_leave_one_recording_and_a_report_each(replay: Run, noisy_session: Session) -> None:
