@@ -21,7 +21,8 @@ PARTS = ("prim", "mapping", "detect", "recorder", "replay")
 ARROWS: dict[str, set[str]] = {
     "prim": set(),
     "prim/log/decoding": {"prim"},
-    "prim/log": {"prim", "prim/log/decoding"},
+    "prim/log": {"prim", "prim/log/decoding", "prim/log/mcap"},
+    "prim/log/mcap": {"prim", "prim/log", "prim/log/decoding"},
     "recorder": {"prim", "prim/log"},
     "mapping": {"prim", "mapping/forward"},
     "mapping/forward": {"prim", "mapping"},
@@ -53,6 +54,7 @@ ARROWS: dict[str, set[str]] = {
 
 NARROW = {
     ("mapping", "mapping/forward"): {"mapper"},
+    ("prim/log", "prim/log/mcap"): {"__init__"},
     ("detect", "detect/training"): {"cli"},
     ("detect", "detect/evaluation"): {"cli"},
 }

@@ -47,9 +47,10 @@ MAX_LOSSES = 20
 class McapReader(LogReader):
     """An MCAP log that is open for reading: a :class:`prim.log.source.LogSource`.
 
-    The file's records are surveyed when it is opened, and chunks are read as the survey found them: in the order of
-    log times, or, with ``recover``, in that of the file. What a chunk holds is checked against its index and the
-    summary, whose definitions of channels and counts of messages are held against those in the chunks.
+    The file's records are surveyed when it is opened, and chunks are read as the survey found them, each once. What a
+    chunk holds is checked against its index and the summary, whose definitions of channels and counts of messages are
+    held against those in the chunks. With ``recover`` all chunks are read when it is opened, and those that can be
+    unpacked are believed before any index.
 
     Args:
         file: The file; it begins with the magic of MCAP, as :func:`prim.log.open_log` checks.
@@ -109,12 +110,10 @@ class McapReader(LogReader):
         return None
 
     def messages(self, *topics: str) -> Iterator[Message]:
-        """See :meth:`prim.log.source.LogSource.messages`; a log that is recovered is read in file order."""
+        """See :meth:`prim.log.source.LogSource.messages`."""
         names = {c.id: c.topic for c in self._definitions.channels.values() if c.topic in topics}
         if len(self._shifts) > 1:
             yield from moved_behind_resets(self._written(names), self._shifts)
-        elif self._recover:
-            yield from self._written(names)
         else:
             yield from self._by_time(names)
 
@@ -125,7 +124,7 @@ class McapReader(LogReader):
         channels = [channel.id for channel in self._definitions.channels.values() if channel.topic == topic]
         with damage_refused(self.path):
             times = np.concatenate([np.zeros(0, np.int64), *map(self._written_times, channels)])
-        return times if self._recover else np.sort(times)
+        return np.sort(times)
 
     def _lose(self, what: str) -> None:
         """Note a loss; unless recovering, raise LogReadError."""
@@ -171,11 +170,15 @@ class McapReader(LogReader):
         """Read all blocks: count their messages by channel, and note definitions, times, and what is damaged."""
         counts: Counter[int] = Counter()
         times: dict[int, list[int]] = {}
+        readable: list[Block] = []
         for block in self._survey.blocks:
             contents = self._contents(block, ALL_CHANNELS)
             if contents is None:
                 continue
+            readable.append(block)
             counts.update(contents[1].counts)
+            if contents[1].first_time is not None:
+                block.start_time, block.end_time = contents[1].first_time, contents[1].last_time
             for time, _, _, channel in contents[1].rows:
                 times.setdefault(channel, []).append(time)
         self._times = {channel: as_stamps(of_channel) for channel, of_channel in times.items()}
@@ -187,6 +190,7 @@ class McapReader(LogReader):
                 self.lost += [*self._survey.contradictions(), *_miscounted(self._survey, counts)]
             if len(self.lost) > MAX_LOSSES:
                 self.lost[MAX_LOSSES:] = [f"and at {len(self.lost) - MAX_LOSSES} more places"]
+        self._survey.blocks = readable
         return counts
 
     def _complete_definitions(self, counts: Counter[int]) -> None:
@@ -283,7 +287,10 @@ class McapReader(LogReader):
                     yield Message(names[channel], time, data[start:stop])
 
     def _by_time(self, names: Mapping[int, str]) -> Iterator[Message]:
-        """Yield messages in the order of log times; those of one time in that of the file."""
+        """Yield messages in the order of log times; those of one time in that of the file.
+
+        Where too many would have to wait for others, that is an error; when recovering, they do not wait.
+        """
         blocks = [block for block in self._survey.blocks if self._may_hold(block, names)]
         blocks.sort(key=attrgetter("start_time", "at"))
         if all(earlier.end_time <= later.start_time for earlier, later in pairwise(blocks)):
@@ -296,10 +303,10 @@ class McapReader(LogReader):
             for position, message in enumerate(self._sorted(block, names)):
                 heapq.heappush(waiting, (message.log_time, block.at, position, message))
                 held += len(message.data)
-            if held > self._limit:
+            if held > self._limit and not self._recover:
                 what = f"its chunks overlap in time: more than {megabytes(self._limit)} of messages wait to be sorted"
-                raise LogReadError(self.path, what, "read them in the order of the file with --recover")
-            while waiting and (later is None or waiting[0][0] < later.start_time):
+                raise LogReadError(self.path, what, "read it without sorting all of them with --recover")
+            while waiting and (later is None or held > self._limit or waiting[0][0] < later.start_time):
                 message = heapq.heappop(waiting)[3]
                 held -= len(message.data)
                 yield message

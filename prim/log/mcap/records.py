@@ -137,7 +137,18 @@ def record_at(stream: IO[bytes], at: int, size: int) -> Record:
 
 
 def read_body(stream: IO[bytes], record: Record) -> bytes:
-    """Read what follows a record's prefix. Raises DamageError where the file ends before."""
+    """Read what follows a record's prefix.
+
+    Args:
+        stream: The file.
+        record: The record.
+
+    Returns:
+        The bytes.
+
+    Raises:
+        DamageError: The file ends before.
+    """
     stream.seek(record.body)
     data = stream.read(record.length)
     if len(data) < record.length:
@@ -180,7 +191,18 @@ def parse(kind: type[Kind], body: bytes, fills: bool = False) -> Kind:
 
 
 def read_chunk_head(stream: IO[bytes], record: Record) -> ChunkHead:
-    """Read what a chunk says of itself. Raises DamageError where its lengths do not add up."""
+    """Read what a chunk says of itself.
+
+    Args:
+        stream: The file.
+        record: The chunk.
+
+    Returns:
+        What it says.
+
+    Raises:
+        DamageError: Its lengths do not add up.
+    """
     stream.seek(record.body)
     head = stream.read(min(record.length, _CHUNK.size + MAX_COMPRESSION_NAME + 8))
     try:
