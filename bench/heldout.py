@@ -28,7 +28,7 @@ from prim.choices import MapperName
 from prim.log import open_log
 from prim.scan import Scan
 from prim.se2 import Pose2D
-from replay.mapping_stage import grid_frame_of_scans
+from replay.map_bounds import extent_of_scans
 
 EVERY = 5
 CLIPS = (1e-5, 1e-4, 1e-3, 1e-2)
@@ -49,9 +49,9 @@ def rays_of(scans: Posed) -> RayStore:
 
 def frame_of(scans: Posed, resolution: float) -> GridFrame:
     """Compute the frame of the end points of all beams; the side of a cell is ``resolution`` (m)."""
-    frame = grid_frame_of_scans(scans, resolution)
-    assert frame is not None
-    return frame
+    bounds = extent_of_scans(scans, resolution)
+    assert bounds is not None
+    return GridFrame.covering(bounds, resolution)
 
 
 def score(

@@ -13,6 +13,10 @@ SHOWN = 80
 """A value that a message quotes is cut to this many characters; set by hand."""
 
 
+MAX_BYTES = 64_000_000
+"""Larger JSON is not read: as objects it would take some ten times as much memory. Set by hand."""
+
+
 def finite(value: Any) -> Any:
     """Return a value as JSON can hold it.
 
@@ -48,8 +52,10 @@ def loads(text: str | bytes) -> Any:
     """Parse JSON.
 
     Raises:
-        ValueError: It is none, or nested too deeply to be read.
+        ValueError: It is none, nested too deeply to be read, or larger than MAX_BYTES.
     """
+    if len(text) > MAX_BYTES:
+        raise ValueError(f"it is of {len(text) / 1e6:.0f} MB, more than {MAX_BYTES / 1e6:.0f}")
     try:
         return json.loads(text)
     except RecursionError:

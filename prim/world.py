@@ -26,6 +26,10 @@ Bounds = tuple[float, float, float, float]
 """An axis-aligned rectangle of the map frame: x0, y0, x1, y1 (m), the least x and y first."""
 
 
+MAX_ITEMS = 20_000
+"""A world has no more primitives, and no more walls: each is met by every beam's ray. Set by hand."""
+
+
 @dataclass(frozen=True)
 class World:
     """Primitives and thin walls on a rectangular floor, in the map frame.
@@ -119,6 +123,8 @@ def _listed(value: Mapping[str, Any], key: str) -> list[Any]:
     items = value.get(key, [])
     if not isinstance(items, list):
         raise ValueError(f"{key} is a list, not {strict_json.shown(items)}")
+    if len(items) > MAX_ITEMS:
+        raise ValueError(f"{key} has {len(items):,} items, more than {MAX_ITEMS:,}")
     return items
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,19 +13,13 @@ import numpy as np
 
 from mapping.forward.mapper import estimate_range_noise
 from mapping.grid import GridFrame, MapSizeError, OccupancyGrid
-from mapping.kernels import MAX_STEPS, scan_extent
+from mapping.kernels import MAX_STEPS
 from mapping.mapper import Mapper, make_mapper
 from prim.errors import LogReadError
 from prim.scan import PosedScan, Scan
-from prim.se2 import Pose2D
-from prim.world import World
 from replay.options import ReplayOptions
-from replay.poses.sensors import REST_HINT
 from replay.scans.posed_scans import PosedScans
 from replay.timing import StageTimer
-
-WORLD_MARGIN = 0.1
-"""Automatic bounds reach this far (m) beyond the recorded world."""
 
 NOISE_SCANS = 200
 """Where only the range noise is wanted, it is estimated from about this many scans, evenly spread; set by hand."""
@@ -150,65 +144,6 @@ def blames_log_for_size(path: Path, options: ReplayOptions) -> Iterator[None]:
             "or the --bounds"
         )
         raise LogReadError(path, f"by its world, poses and ranges, {error.what}", hint) from error
-
-
-def choose_grid_frame(posed_scans: PosedScans, options: ReplayOptions, world: World | None) -> GridFrame:
-    """Choose the place and size of the map's grid by the given bounds, else the recorded world, else the end points.
-
-    Args:
-        posed_scans: The scans to be mapped.
-        options: The resolution and, where they are given, the bounds.
-        world: The recorded world; None where it is not known.
-
-    Returns:
-        The smallest grid of whole cells that covers the bounds.
-
-    Raises:
-        LogReadError: The bounds follow from the end points, and no usable scan has a pose.
-        MapSizeError: It would have too many cells.
-    """
-    if options.bounds is not None:
-        return GridFrame.covering(options.bounds, options.resolution)
-    if world is not None:
-        return grid_frame_of_world(world, options.resolution)
-    frame = grid_frame_of_scans((piece for posed in posed_scans for piece in posed.pieces), options.resolution)
-    if frame is None:
-        path = posed_scans.scan_log.path
-        raise LogReadError(path, "no scan that can be used has a pose", REST_HINT)
-    return frame
-
-
-def grid_frame_of_world(world: World, resolution: float) -> GridFrame:
-    """Compute the place and size of the grid that a recorded world is mapped on.
-
-    Args:
-        world: The world.
-        resolution: Side of a cell (m).
-
-    Returns:
-        The smallest grid of whole cells that covers the world and a margin of WORLD_MARGIN.
-    """
-    x0, y0, x1, y1 = world.bounds
-    m = WORLD_MARGIN
-    return GridFrame.covering((x0 - m, y0 - m, x1 + m, y1 + m), resolution)
-
-
-def grid_frame_of_scans(scans: Iterable[tuple[Scan, Pose2D]], resolution: float) -> GridFrame | None:
-    """Compute the place and size of the grid that holds the end points of all measured beams, and the sensor.
-
-    Args:
-        scans: Scans, or pieces of them, with the laser's poses.
-        resolution: Side of a cell (m).
-
-    Returns:
-        The smallest such grid; None without scans.
-    """
-    extents = [scan_extent(scan, pose, resolution) for scan, pose in scans]
-    if not extents:
-        return None
-    row, col = np.min([extent[:2] for extent in extents], axis=0).tolist()
-    last_row, last_col = np.max([extent[2:] for extent in extents], axis=0).tolist()
-    return GridFrame(resolution, row, col, last_row - row + 1, last_col - col + 1)
 
 
 def make_replay_mapper(

@@ -15,7 +15,8 @@ from prim.scan import PosedScan
 from replay.branch import Branch
 from replay.ground_truth import GroundTruth
 from replay.localization import Localization, localize, pose_scans
-from replay.mapping_stage import blames_log_for_size, choose_grid_frame
+from replay.map_bounds import choose_map_bounds
+from replay.mapping_stage import blames_log_for_size
 from replay.options import ReplayOptions
 from replay.replay_evaluator import ReplayEvaluator
 from replay.result import ReplayResult, distinct_notes
@@ -92,7 +93,8 @@ class Pipeline:
             truth = self._read_truth(scans.log)
             scans, poses, true_poses, _ = self._localize(scans)
             posed_scans = pose_scans(scans, poses, self.options, self._timer)
-            frame = choose_grid_frame(posed_scans, self.options, truth.world if truth else None)
+            frame, notes = choose_map_bounds(posed_scans, self.options, truth.world if truth else None)
+            self._notes += notes
             evaluator = ReplayEvaluator(frame, truth, poses, true_poses)
             branches = self._branches(frame, posed_scans, evaluator)
             self._begin_viewer(frame, posed_scans, branches, evaluator)
