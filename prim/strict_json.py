@@ -13,7 +13,7 @@ SHOWN = 80
 """A value that a message quotes is cut to this many characters; set by hand."""
 
 
-MAX_BYTES = 64_000_000
+MAX_BYTES = 16_000_000
 """Larger JSON is not read: as objects it would take some ten times as much memory. Set by hand."""
 
 

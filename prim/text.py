@@ -2,6 +2,28 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+
+MOST_LISTED = 20
+"""A message lists so many names."""
+
+LONGEST_NAME = 100
+"""A message cuts names that have more characters."""
+
+
+def listed(names: Iterable[str]) -> str:
+    """Return names as a message lists them: the first of many, and how many more there are.
+
+    Args:
+        names: The names.
+
+    Returns:
+        The list, separated by commas; empty without names.
+    """
+    cut = [name if len(name) <= LONGEST_NAME else f"{name[: LONGEST_NAME - 1]}…" for name in names]
+    more = len(cut) - MOST_LISTED
+    return ", ".join(cut[:MOST_LISTED]) + (f" and {more:,} more" if more > 0 else "")
+
 
 def printable(text: str) -> str:
     r"""Return a line of text as it may be shown anywhere.

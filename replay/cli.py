@@ -197,6 +197,12 @@ def replay(
     force: Annotated[
         bool, typer.Option("--force", help="Replace files that are no earlier results of prim-replay.")
     ] = False,
+    max_memory: Annotated[
+        float | None,
+        typer.Option(
+            metavar="GB", help="Refuse a replay that would take more memory. [default: half of the machine's]"
+        ),
+    ] = None,
     recover: Annotated[bool, typer.Option("--recover", help="Read what is intact of a damaged log.")] = False,
     list_topics: Annotated[
         bool,
@@ -236,6 +242,7 @@ def replay(
         odom_topic=odom_topic,
         laser_offset=_in_radians(laser_offset),
         max_range=max_range,
+        max_memory=max_memory,
         standing_still=standing_still,
         fuse=fuse,
         gps_topic=gps_topic,

@@ -36,6 +36,7 @@ class ReplayKeywords(TypedDict, total=False):
     laser_offset: tuple[float, float, float] | Pose2D | None
     """The laser's pose on the robot: x, y (m), heading (rad)."""
     max_range: float | None
+    max_memory: float | None
     standing_still: bool
     fuse: Sequence[str] | str | None
     """The sensors to fuse, of «odom», «gps», «compass»: a list, or separated by commas."""

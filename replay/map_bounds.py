@@ -120,7 +120,9 @@ def choose_map_bounds(
     if 3 * noise > options.blurred_extent * min(bounds[2] - bounds[0], bounds[3] - bounds[1]):
         bounds = _without_noise(sample, bounds, noise, replay.resolution, options)
         share = float(np.mean(~_inside(points, bounds)))
-        what = f"noise of about {noise:.2g} m carries {share:.0%} of the end points beyond {{}}, which hold the surfaces"
+        what = (
+            f"noise of about {noise:.2g} m carries {share:.0%} of the end points beyond {{}}, which hold what it hit"
+        )
         notes.append(_note(what, bounds, extent, replay.resolution))
     return MapBounds(GridFrame.covering(bounds, replay.resolution), tuple(notes))
 

@@ -53,6 +53,7 @@ class ReplayOptions:
         odom_topic: The topic of poses; None: found by type. Where one is given, the source ``auto`` means ``odom``.
         laser_offset: The laser's pose on the robot (m, rad); None where tf has it.
         max_range: Ranges beyond this count as no return (m); None for the scanner's own range_max.
+        max_memory: A replay that would take more memory (GB) is refused; None for half of the machine's.
         standing_still: The robot does not move: map without poses.
         fuse: What poses are fused from.
         deskew: Whether the laser's motion during a scan is compensated for.
@@ -87,6 +88,7 @@ class ReplayOptions:
     odom_topic: str | None = None
     laser_offset: Pose2D | None = None
     max_range: float | None = None
+    max_memory: float | None = None
     standing_still: bool = False
     fuse: FusionInputs = field(default_factory=FusionInputs)
     deskew: bool = True
@@ -108,6 +110,8 @@ class ReplayOptions:
             raise UsageError(f"--rate is {self.rate:g}: it must be above 0, from {MIN_RATE:g} to {MAX_RATE:g}")
         if self.max_range is not None and not self.max_range > 0:
             raise UsageError(f"--max-range is {self.max_range:g}: it must be above 0")
+        if self.max_memory is not None and not self.max_memory > 0:
+            raise UsageError(f"--max-memory is {self.max_memory:g}: it must be above 0")
         if self.map_every is not None and self.map_every < 1:
             raise UsageError(f"--map-every is {self.map_every}: it must be at least 1")
         every = self.detect_every

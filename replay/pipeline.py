@@ -17,6 +17,7 @@ from replay.ground_truth import GroundTruth
 from replay.localization import Localization, localize, pose_scans
 from replay.map_bounds import choose_map_bounds
 from replay.mapping_stage import blames_log_for_size
+from replay.memory import MemoryBudget
 from replay.options import ReplayOptions
 from replay.replay_evaluator import ReplayEvaluator
 from replay.result import ReplayResult, distinct_notes
@@ -96,10 +97,12 @@ class Pipeline:
             frame, notes = choose_map_bounds(posed_scans, self.options, truth.world if truth else None)
             self._notes += notes
             evaluator = ReplayEvaluator(frame, truth, poses, true_poses)
+            budget = MemoryBudget(self.path, self.options, frame)
+            budget.check(scans.expected_rays)
             branches = self._branches(frame, posed_scans, evaluator)
             self._begin_viewer(frame, posed_scans, branches, evaluator)
             with self._interrupts.held():
-                self._map_and_detect(posed_scans, branches, evaluator)
+                self._map_and_detect(posed_scans, branches, evaluator, budget)
                 results = self._results(log, posed_scans, evaluator, branches)
                 self._show_results(results)
         return results
@@ -133,11 +136,16 @@ class Pipeline:
         ]
 
     def _map_and_detect(
-        self, posed_scans: PosedScans, branches: Sequence[Branch], evaluator: ReplayEvaluator
+        self,
+        posed_scans: PosedScans,
+        branches: Sequence[Branch],
+        evaluator: ReplayEvaluator,
+        budget: MemoryBudget,
     ) -> None:
         """Map all scans and detect primitives by each branch; where that is interrupted, make maps of what there is.
 
         Raises:
+            LogReadError: There are more rays than there is memory for.
             KeyboardInterrupt: There was an interruption before the first scan, or nothing is to be kept.
         """
         try:
@@ -146,6 +154,7 @@ class Pipeline:
                 self._show_scan(posed, evaluator)
                 for branch in branches:
                     branch.update(posed)
+                budget.check(branches[0].usage.rays)
             for branch in branches:
                 branch.finish_map()
                 branch.finish_detection()

@@ -111,8 +111,12 @@ class SufficientStatistics:
         return RangeNoise(min(max(std, options.min_noise_cells * resolution), options.max_noise), share)
 
 
+GROWTH, LEAST_ROWS = 1.125, 4096
+"""By how much an array of rays grows at least, and how many rows it then has at least."""
+
+
 class RayStore:
-    """All rays so far, 12 bytes each, and their scans; grows in amortised constant time."""
+    """All rays so far, up to 16 bytes each with their scans; grows in amortised constant time."""
 
     def __init__(self, max_range: float = DEFAULTS.max_range) -> None:
         """Start without rays.
@@ -154,9 +158,8 @@ class RayStore:
         directions = rotate(scan.directions[used], pose.theta)
         count = len(directions)
         begin, end = len(self), len(self) + count
-        self._rays = _grown(self._rays, end)
-        self._scans = _grown(self._scans, self._count + 1)
-        self._first = _grown(self._first, self._count + 2)
+        for array, rows in ((self._rays, end), (self._scans, self._count + 1), (self._first, self._count + 2)):
+            _grow(array, rows)
         self._rays[begin:end, :2] = directions
         self._rays[begin:end, 2] = ranges
         self._scans[self._count] = pose.x, pose.y, max(scan.range_min, 0.0), min(scan.range_max, self._max_range)
@@ -165,13 +168,15 @@ class RayStore:
         return count
 
 
-def _grown(array: NDArray[Any], length: int) -> NDArray[Any]:
-    """Return the array, or a copy with room for twice as many rows where it has fewer than ``length``."""
-    if len(array) >= length:
-        return array
-    grown = np.empty((max(2 * len(array), length), *array.shape[1:]), array.dtype)
-    grown[: len(array)] = array
-    return grown
+def _grow(array: NDArray[Any], length: int) -> None:
+    """Make room in an array for ``length`` rows, and some more, where it has fewer.
+
+    Arrays that are large enough for that are moved by the operating system, and never there twice. No view of the
+    array may be in use.
+    """
+    if len(array) < length:
+        rows = max(int(GROWTH * len(array)), length, LEAST_ROWS)
+        array.resize((rows, *array.shape[1:]), refcheck=False)
 
 
 class Fold(IntEnum):

@@ -19,6 +19,7 @@ from prim.log.decoding.codecs import SCAN_CONTENTS
 from prim.log.reader import LogReader
 from prim.log.source import Message, Topic
 from prim.log.time_resets import find_shifts, moved_behind_resets, reset_notes
+from prim.text import listed
 
 METADATA = "metadata.yaml"
 """The file in a ROS 2 bag's folder that lists the others."""
@@ -42,17 +43,17 @@ def files_of_bag(folder: Path) -> list[Path]:
     Raises:
         LogReadError: The folder holds no log, or several that do not belong together.
     """
-    listed = _listed_files(folder)
-    if any(file.exists() for file in listed):
-        return listed
+    named = _listed_files(folder)
+    if any(file.exists() for file in named):
+        return named
     by_stem = {_stem(path): path for path in sorted(folder.iterdir(), key=_preference, reverse=True) if _is_log(path)}
     found = sorted(by_stem.values(), key=_part_number)
-    if not found and listed:
-        return listed
+    if not found and named:
+        return named
     if not found:
         raise LogReadError(folder, "a folder without a log in it", "give a log, or the folder of a ROS 2 bag")
     if len(found) > 1 and len({_part_number(path)[0] for path in found}) > 1:
-        names = ", ".join(path.name for path in found)
+        names = listed(path.name for path in found)
         raise LogReadError(
             folder, f"a folder with {len(found)} logs ({names})", f"give one of them: {shlex.quote(str(found[0]))}"
         )

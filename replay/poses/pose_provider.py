@@ -15,6 +15,7 @@ from prim.log.decoding.codecs import Content
 from prim.log.messages import BASE_FRAME, MAP_FRAME, TRUE_POSE_TOPIC
 from prim.log.source import LogSource, Topic
 from prim.se2 import Pose2D, compose_covariances, compose_poses
+from prim.text import listed
 from replay.poses.fusion import Fusion, PoseEstimate
 from replay.poses.fusion_nodes import FusionNodes
 from replay.poses.fusion_options import COMPASS, GPS, ODOM, FusionInputs, FusionOptions, SensorNoise
@@ -257,7 +258,7 @@ class PoseProvider:
             )
         if robot is None:
             tree = self._mounts.tree
-            frames = ", ".join(sorted({*tree.edges, *tree.parents}))
+            frames = listed(sorted({*tree.edges, *tree.parents}))
             what = f"tf has no chain from {name!r} to a fixed frame (its frames: {frames or 'none'})"
             raise LogReadError(self._log.path, what, OTHER_POSES)
         robot_chain = self._mounts.fixed_chain(robot)

@@ -17,6 +17,7 @@ from prim.log.decoding.values import StampedVector, planar_pose
 from prim.log.messages import TRUE_POSE_TOPIC
 from prim.log.source import LogSource, Topic
 from prim.se2 import MAX_COORDINATE, Trajectory
+from prim.text import listed
 from replay.poses.transforms import is_valid_pose
 
 GPS_CONTENTS = (Content.POINT, Content.FIX)
@@ -148,7 +149,7 @@ def find_pose_topic(log: LogSource, requested: str | None = None) -> Topic | Non
     """
     poses = log.holding(*POSE_CONTENTS)
     topics = [topic for topic in poses if topic.name != TRUE_POSE_TOPIC or topic.name == requested]
-    names = ", ".join(f"{topic.name} ({topic.type})" for topic in topics) or "none"
+    names = listed(f"{topic.name} ({topic.type})" for topic in topics) or "none"
     if requested is not None:
         chosen = [topic for topic in topics if topic.name == requested]
         if not chosen:
@@ -250,17 +251,16 @@ def _find(
     if requested is not None:
         chosen = [topic for topic in topics if topic.name == requested]
         if not chosen:
-            there = ", ".join(f"{topic.name} ({topic.type})" for topic in topics) or "none"
+            there = listed(f"{topic.name} ({topic.type})" for topic in topics) or "none"
             raise LogReadError(
                 log.path, f"no {' or '.join(contents)} on {requested}", f"topics with such messages: {there}"
             )
         return chosen[0]
     likely = [topic for topic in topics if not set(names).isdisjoint(re.split(r"[/_]", topic.name.lower()))]
     if len(likely) > 1:
-        listed = ", ".join(topic.name for topic in likely)
         raise LogReadError(
             log.path,
-            f"{len(likely)} topics to choose from: {listed}",
+            f"{len(likely)} topics to choose from: {listed(topic.name for topic in likely)}",
             f"choose one with {option} {shlex.quote(likely[0].name)}",
         )
     return likely[0] if likely else None

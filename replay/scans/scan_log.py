@@ -19,6 +19,7 @@ from prim.errors import LogReadError
 from prim.log.decoding.codecs import Content
 from prim.log.source import LogSource, Topic
 from prim.scan import Scan, reconciled_angles
+from prim.text import listed
 from replay.notes import pluralize
 from replay.poses.laser_poses import BeamTimes, ScanTimes
 from replay.scans.clock import find_clock, on_clock
@@ -141,12 +142,18 @@ class ScanLog:
     @property
     def names(self) -> str:
         """The names of the topics, for people."""
-        return ", ".join(topic.name for topic in self.topics)
+        return listed(topic.name for topic in self.topics)
 
     @property
     def first(self) -> Scan:
         """The first usable scan of the first scanner."""
         return self.scanners[0].first
+
+    @property
+    def expected_rays(self) -> int:
+        """The number of rays of the selected scans, if each scanner's have as many as its first one."""
+        beams = np.array([len(scanner.first.ranges) for scanner in self.scanners])
+        return int(beams[self.scanner].sum())
 
     @property
     def times(self) -> ScanTimes:

@@ -9,6 +9,7 @@ from itertools import pairwise
 from prim.errors import LogReadError
 from prim.log.decoding.codecs import SCAN_CONTENTS, Content
 from prim.log.source import LogSource, Topic
+from prim.text import listed
 from replay.poses.transforms import TransformTree
 
 
@@ -33,7 +34,7 @@ def choose_scan_topics(log: LogSource, wanted: Sequence[str]) -> tuple[list[Topi
         raise _without_scans(log)
     if len(topics) == 1:
         return topics, ()
-    names = ", ".join(topic.name for topic in topics)
+    names = listed(topic.name for topic in topics)
     if _carried_by_one_robot(log, topics):
         note = (
             f"{len(topics)} scanners of one robot are mapped together ({names}); for one of them give --scan-topic "
@@ -48,7 +49,7 @@ def _requested(log: LogSource, name: str) -> Topic:
     chosen = next((topic for topic in topics if topic.name == name), None)
     if chosen is not None:
         return chosen
-    hint = f"its scan topics: {', '.join(topic.name for topic in topics)}" if topics else listing(log)
+    hint = f"its scan topics: {listed(topic.name for topic in topics)}" if topics else listing(log)
     is_empty = name in log.topics and log.topics[name].content in SCAN_CONTENTS
     raise LogReadError(log.path, f"no messages on {name}" if is_empty else f"no LaserScan on {name}", hint)
 
@@ -56,7 +57,7 @@ def _requested(log: LogSource, name: str) -> Topic:
 def _without_scans(log: LogSource) -> LogReadError:
     empty = [topic.name for topic in log.topics.values() if topic.content in SCAN_CONTENTS]
     if empty:
-        return LogReadError(log.path, f"no messages on {', '.join(empty)}", "; ".join(log.lost))
+        return LogReadError(log.path, f"no messages on {listed(empty)}", "; ".join(log.lost))
     return LogReadError(log.path, "no LaserScan in this log", listing(log))
 
 
@@ -75,5 +76,5 @@ def _carried_by_one_robot(log: LogSource, topics: Sequence[Topic]) -> bool:
 def listing(log: LogSource) -> str:
     """Return the log's topics and what was lost, as a hint."""
     topics = sorted(log.topics.values(), key=lambda topic: topic.name)
-    listed = ", ".join(f"{topic.name} ({topic.type or topic.encoding})" for topic in topics)
-    return "; ".join([f"its topics: {listed}" if listed else "it has no topics at all", *log.lost])
+    names = listed(f"{topic.name} ({topic.type or topic.encoding})" for topic in topics)
+    return "; ".join([f"its topics: {names}" if names else "it has no topics at all", *log.lost])
