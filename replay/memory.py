@@ -70,6 +70,6 @@ class MemoryBudget:
         )
         more = f"allow it with --max-memory {math.ceil(1.01 * gigabytes * 10) / 10:g}"
         if self._fixed >= allowed:
-            raise LogReadError(self._log, what, f"give a coarser --resolution or smaller --bounds, or {more}")
+            raise LogReadError(self._log, what, f"{more}, or take larger cells")
         stride = math.ceil(rays * self._per_ray / (allowed - self._fixed))
-        raise LogReadError(self._log, what, f"replay every {stride}th scan with --stride {stride}, or {more}")
+        raise LogReadError(self._log, what, f"replay fewer scans with --stride {stride}, or {more}")

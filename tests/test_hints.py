@@ -239,6 +239,7 @@ OF_TYPES = "a type that a parameter has: tests/replay/test_api.py"
 
 NOT_IN_TABLES = {
     "--debug shows the traceback": "tests/prim/test_console.py",
+    "read it without sorting all of them with --recover": "tests/prim/log/test_mcap_damage.py",
     "a larger --resolution or a part of the log takes less": "how much memory there is",
     "(try: {} --help)": ABOVE,
     "m is too large to drive on: give": ABOVE,

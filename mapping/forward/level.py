@@ -111,10 +111,6 @@ class SufficientStatistics:
         return RangeNoise(min(max(std, options.min_noise_cells * resolution), options.max_noise), share)
 
 
-GROWTH, LEAST_ROWS = 1.125, 4096
-"""By how much an array of rays grows at least, and how many rows it then has at least."""
-
-
 class RayStore:
     """All rays so far, up to 16 bytes each with their scans; grows in amortised constant time."""
 
@@ -175,7 +171,7 @@ def _grow(array: NDArray[Any], length: int) -> None:
     array may be in use.
     """
     if len(array) < length:
-        rows = max(int(GROWTH * len(array)), length, LEAST_ROWS)
+        rows = max(len(array) * 9 // 8, length, 4096)
         array.resize((rows, *array.shape[1:]), refcheck=False)
 
 

@@ -290,6 +290,12 @@ def earlier_file() -> list[str]:
     return [write("a.mcap")]
 
 
+def noisy() -> list[str]:
+    """Ranges with more noise than a room of 2 m has room for."""
+    ranges = 1.0 + 0.3 * np.random.default_rng(1).standard_normal(90).astype(np.float32)
+    return [write("a.mcap", Topics(scan=replace(SCAN, ranges=ranges)))]
+
+
 FEW = Topics(scan=replace(SCAN, ranges=SCAN.ranges[:3]))
 SPACE = Topics(scans=("/my scan", "/rear"), frames=("front", "rear"))
 TWO = Topics(scans=("/front", "/rear"), frames=("front", "rear"))
@@ -300,6 +306,8 @@ ENDLESS = Topics(
     scan=replace(SCAN, range_max=math.inf, ranges=np.array([np.inf] * 9 + [1.0] * 81, dtype=np.float32)),
 )
 TOO_FAR = Topics(scan=replace(SCAN, range_max=5e4, ranges=np.array([4.5e4] * 9 + [1.0] * 81, dtype=np.float32)))
+
+MANY = Topics(scan=replace(SCAN, angle_increment=2 * math.pi / 30_000, ranges=np.full(30_000, 1.0, dtype=np.float32)))
 
 Taking = Callable[[list[str], str], list[str]]
 
@@ -437,6 +445,11 @@ SITUATIONS = {
     "too long ranges": Situation(
         only("--bounds", "-2", "-2", "2", "2", topics=TOO_FAR), "where they end is not on the map; give", code=0
     ),
+    "noise beyond the bounds": Situation(noisy, "for all of them give --bounds", code=0),
+    "too many rays for the memory": Situation(
+        only("--mapper", "forward", "--max-memory", "0.305", topics=MANY), "replay fewer scans with --stride {}, or"
+    ),
+    "too many cells for the memory": Situation(only("--max-memory", "0.3"), "allow it with --max-memory"),
     "corrected poses": Situation(corrected_carmen, "for the robot's own give", code=0, stays=True),
     "no noise": Situation(
         only("--sensor-model", "gaussian", "--n-scans", "1", topics=FEW), "give it, such as --noise-std"
