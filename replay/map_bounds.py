@@ -38,7 +38,7 @@ WORLD_MARGIN = 0.1
 
 @dataclass(frozen=True)
 class MapBoundsOptions:
-    """How the bounds of a map follow from end points; set by hand, the last three on simulated logs.
+    """How the bounds of a map follow from end points; set by hand, the last five on simulated logs.
 
     Attributes:
         sampled_scans: The bulk of the end points is that of at least half as many scans, evenly spread.
@@ -51,6 +51,7 @@ class MapBoundsOptions:
         noise_tail_share: The map leaves out this share of the end points at either end of either axis, after the
             coarse map has told from which cells they are.
         passes: The coarse map is made anew within its own bounds at most so often.
+        margin: The map then reaches so many of its cells beyond them.
     """
 
     sampled_scans: int = 400
@@ -61,6 +62,7 @@ class MapBoundsOptions:
     cells_per_std: float = 10.0
     noise_tail_share: float = 0.0025
     passes: int = 4
+    margin: int = 5
 
 
 OPTIONS = MapBoundsOptions()
@@ -281,13 +283,17 @@ def _without_noise(
         before, bounds = bounds, _bounds_of_hits(mapper.fit(), options.noise_tail_share)
         if bounds == before:
             break
-    positions = sample.positions()
-    return _union(bounds, _extent(positions[_inside(positions, before)])) if len(positions) else bounds
+    margin, positions = options.margin * resolution, sample.positions()
+    bounds = bounds[0] - margin, bounds[1] - margin, bounds[2] + margin, bounds[3] + margin
+    near = positions[_inside(positions, before)]
+    return _union(bounds, _extent(near)) if len(near) else bounds
 
 
 def _bounds_of_hits(fit: ForwardFit, share: float) -> Bounds:
     """Return the bounds (m) of a map's expected hits but for a share of them at either end of either axis."""
     hits = (fit.stopping * fit.visits).astype(float)
+    if not hits.any():
+        return fit.frame.bounds
     sides = []
     for axis, first in ((0, fit.frame.col), (1, fit.frame.row)):
         reached = np.cumsum(hits.sum(axis=axis))

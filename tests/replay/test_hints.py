@@ -326,6 +326,11 @@ def in_place_of(name: str) -> Taking:
     return take
 
 
+def four_numbers(arguments: list[str], text: str) -> list[str]:
+    """Give the bounds that the text ends with."""
+    return [*arguments, "--bounds", *text.split()[-4:]]
+
+
 def path(arguments: list[str], text: str) -> list[str]:
     """Replay the log that the text ends with."""
     return [hints.suggested_path(text), *arguments[1:]]
@@ -445,7 +450,7 @@ SITUATIONS = {
     "too long ranges": Situation(
         only("--bounds", "-2", "-2", "2", "2", topics=TOO_FAR), "where they end is not on the map; give", code=0
     ),
-    "noise beyond the bounds": Situation(noisy, "for all of them give --bounds", code=0),
+    "noise beyond the bounds": Situation(noisy, "for all of them give --bounds", four_numbers, 0),
     "too many rays for the memory": Situation(
         only("--mapper", "forward", "--max-memory", "0.305", topics=MANY), "replay fewer scans with --stride {}, or"
     ),
