@@ -1,0 +1,47 @@
+"""Replays that would take more memory than is allowed are refused."""
+
+from pathlib import Path
+
+import pytest
+
+from mapping.grid import GridFrame
+from prim.errors import LogReadError, UsageError
+from prim.memory import machine_memory
+from replay.memory import MemoryBudget
+from replay.options import ReplayOptions
+
+FRAME = GridFrame(0.01, 0, 0, 1000, 1000)
+
+
+def budget(mapper: str, gigabytes: float | None = None) -> MemoryBudget:
+    return MemoryBudget(Path("a.mcap"), ReplayOptions(mapper=mapper, max_memory=gigabytes), FRAME)
+
+
+def test_forward_takes_16_bytes_a_ray() -> None:
+    """0.3 GB, a million cells of 100 bytes, and the rays."""
+    budget("forward", 2.0).check(100_000_000)
+    with pytest.raises(LogReadError, match=r"--stride 2, or allow it with --max-memory 2\.1$"):
+        budget("forward", 2.0).check(100_000_001)
+    with pytest.raises(LogReadError, match=r"--stride 11, or"):
+        budget("forward", 2.0).check(1_050_000_000)
+
+
+def test_other_mappers_keep_no_rays() -> None:
+    budget("det,prob", 0.4).check(10**15)
+
+
+def test_cells_that_are_too_many_are_refused_before_the_first_scan() -> None:
+    with pytest.raises(LogReadError, match=r"take about 0\.4 GB.*allow it with --max-memory 0\.5"):
+        budget("forward", 0.3999).check(0)
+
+
+def test_half_of_the_machine_is_allowed() -> None:
+    rays = int((machine_memory() / 2 - 0.4e9) / 16)
+    budget("forward").check(rays - 1)
+    with pytest.raises(LogReadError):
+        budget("forward").check(rays + 2)
+
+
+def test_no_memory_is_no_option() -> None:
+    with pytest.raises(UsageError, match="--max-memory is 0"):
+        ReplayOptions(max_memory=0.0)
