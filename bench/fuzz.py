@@ -30,7 +30,7 @@ from typing import Any
 from bench.fuzzing.case import Case
 from bench.fuzzing.judge import LISTING, RECOVER, Limits, Outcome, problem
 from bench.fuzzing.kinds import KINDS, make_case, plan
-from bench.fuzzing.samples import PART, Samples, make_samples
+from bench.fuzzing.samples import Samples, make_samples
 from bench.fuzzing.worker import Command, Worker, replay_command
 from prim.text import printable
 
@@ -40,6 +40,18 @@ FAST = ("--mapper", "det", "--no-viewer", "--no-detect")
 WARM_UP = ("mcap", "mcap-lz4", "mcap-unindexed", "bag-bz2", "bag-lz4", "db3.zstd", "foxglove-json", "foxglove-protobuf",
            "carmen-flaser-gz", "mcap-split", "part")  # fmt: skip
 """Samples that a worker replays before any case."""
+
+WARM_OPTIONS = tuple(
+    tuple(words.split())
+    for words in (
+        "--no-detect --mapper det,prob,forward",
+        "--no-detect --pose fused --match-scans",
+        "--no-detect --pose tf",
+        "--no-detect --pose scans",
+        "--pose odom",
+    )
+)
+"""Options with which a worker replays a sample before any case."""
 
 QUOTED = 240
 """So much of an error a finding quotes (characters)."""
@@ -91,11 +103,12 @@ class Fuzzer:
     ) -> None:
         self._samples, self._seed, self._jobs, self._limits = samples, seed, jobs, limits
         self._stack = ExitStack()
-        warm_up = [_intact(samples, name) for name in WARM_UP if name in samples.by_name]
+        warm_up = [_intact(samples, name) for name in WARM_UP]
+        warm_up += [replace(_intact(samples, "mcap"), options=("--no-viewer", *options)) for options in WARM_OPTIONS]
         self._workers: SimpleQueue[Worker] = SimpleQueue()
         for _ in range(jobs):
             self._workers.put(self._stack.enter_context(Worker(command, warm_up, limits)))
-        self._contents: dict[str, str] = {}
+        self._contents: dict[str, set[str]] = {}
 
     def __enter__(self) -> Fuzzer:
         return self
@@ -138,17 +151,17 @@ class Fuzzer:
         codes = tuple(outcome.ending.split(":")[0] or str(outcome.code) for outcome in outcomes)
         return Result(kind, number, case.what, codes, tuple(findings)), case
 
-    def _problem(self, case: Case, outcome: Outcome, whole: str) -> str:
+    def _problem(self, case: Case, outcome: Outcome, whole: set[str]) -> str:
         return problem(case, outcome, whole, self._limits)
 
-    def _content(self, worker: Worker, name: str) -> str:
-        """Return the content of a sample. Raises RuntimeError where it cannot be replayed."""
+    def _content(self, worker: Worker, name: str) -> set[str]:
+        """Return the contents of a sample, read plainly and to recover it. Raises RuntimeError where it has none."""
         if name and name not in self._contents:
-            outcome = worker.run(_intact(self._samples, name), (RECOVER,) if name == PART else ())
-            if not outcome.content:
-                raise RuntimeError(f"the intact log {name} cannot be replayed: {outcome}")
-            self._contents[name] = outcome.content
-        return self._contents.get(name, "")
+            outcomes = [worker.run(_intact(self._samples, name), options) for options in ((), (RECOVER,))]
+            self._contents[name] = {outcome.content for outcome in outcomes if outcome.content}
+            if not self._contents[name]:
+                raise RuntimeError(f"the intact log {name} cannot be replayed: {outcomes}")
+        return self._contents.get(name, set())
 
 
 def _intact(samples: Samples, name: str) -> Case:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Container
 from dataclasses import dataclass
 
 from bench.fuzzing.case import Case
@@ -19,7 +20,7 @@ class Limits:
         seconds_per_megabyte: For each MB of input (s).
         megabytes: Peak memory of the process (MB).
         megabytes_per_megabyte: For each MB of input (MB).
-        patience: A run is ended at so many times its CPU time.
+        patience: A run is ended when it has taken so much more CPU time (s): the first one may compile something.
         wall_seconds: A run that uses no CPU time is ended then (s).
     """
 
@@ -27,7 +28,7 @@ class Limits:
     seconds_per_megabyte: float = 2.0
     megabytes: float = 600.0
     megabytes_per_megabyte: float = 4.0
-    patience: float = 2.0
+    patience: float = 10.0
     wall_seconds: float = 120.0
 
     def time(self, megabytes: float) -> float:
@@ -67,13 +68,27 @@ class Outcome:
     megabytes: float = 0.0
 
 
-def problem(case: Case, outcome: Outcome, whole: str, limits: Limits) -> str:
+def is_slow(case: Case, outcome: Outcome, limits: Limits) -> bool:
+    """Return whether a run took more CPU time than it may.
+
+    Args:
+        case: What it was given.
+        outcome: What it did.
+        limits: What it may take.
+
+    Returns:
+        Whether it did.
+    """
+    return outcome.seconds > limits.time(case.megabytes)
+
+
+def problem(case: Case, outcome: Outcome, whole: Container[str], limits: Limits) -> str:
     """Return what is wrong with a run.
 
     Args:
         case: What it was given.
         outcome: What it did.
-        whole: The content of the case's sample; empty where it has none.
+        whole: The contents that the case's sample may have: it is read in another order to recover it.
         limits: What it may take.
 
     Returns:
@@ -106,8 +121,8 @@ def _in_output(case: Case, outcome: Outcome) -> str:
     return ""
 
 
-def _in_content(case: Case, outcome: Outcome, whole: str) -> str:
-    if outcome.code == 0 and case.sample and outcome.content and outcome.content != whole:
+def _in_content(case: Case, outcome: Outcome, whole: Container[str]) -> str:
+    if outcome.code == 0 and case.sample and outcome.content and outcome.content not in whole:
         return "exit code 0 with other content"
     if outcome.code == 1 and case.must_recover and RECOVER in outcome.options:
         return "all is lost to a small hole"
@@ -116,7 +131,7 @@ def _in_content(case: Case, outcome: Outcome, whole: str) -> str:
 
 def _in_effort(case: Case, outcome: Outcome, limits: Limits) -> str:
     seconds, megabytes = limits.time(case.megabytes), limits.memory(case.megabytes)
-    if outcome.seconds > seconds:
+    if is_slow(case, outcome, limits):
         return f"it took {outcome.seconds:.1f} s of CPU time, more than {seconds:.1f}"
     if outcome.megabytes > megabytes:
         return f"it took {outcome.megabytes:.0f} MB of memory, more than {megabytes:.0f}"

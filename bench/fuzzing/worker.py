@@ -8,6 +8,7 @@ import math
 import multiprocessing
 import os
 import resource
+import shutil
 import signal
 import sys
 import time
@@ -19,7 +20,7 @@ from tempfile import TemporaryDirectory
 from typing import Any, NoReturn
 
 from bench.fuzzing.case import MEGABYTE, Case
-from bench.fuzzing.judge import LISTING, Limits, Outcome
+from bench.fuzzing.judge import LISTING, Limits, Outcome, is_slow
 
 Command = Callable[[list[str]], int]
 """What is fuzzed: takes arguments, returns an exit code. Workers import it by its name."""
@@ -81,6 +82,8 @@ class Worker:
         if self._process is None or self._runs >= OLD_AFTER or self.peak > OLD_MEGABYTES:
             self._start()
         outcome = self._run(case, options)
+        if is_slow(case, outcome, self._limits) and not outcome.ending:
+            outcome = self._run(case, options)  # what was compiled the first time is compiled now
         if outcome.ending:
             self._end()
         self._runs += 1
@@ -96,7 +99,7 @@ class Worker:
         theirs.close()
         self._runs, self.peak = 0, 0.0
         for case in self._warm_up:
-            self._run(case, (), patience=math.inf)
+            self._run(case, (), math.inf)
 
     def _end(self) -> None:
         if self._process is not None:
@@ -108,7 +111,7 @@ class Worker:
     def _run(self, case: Case, options: tuple[str, ...], patience: float | None = None) -> Outcome:
         """Run a case, and give up where it takes much more than it may."""
         patience = self._limits.patience if patience is None else patience
-        seconds = patience * self._limits.time(case.megabytes)
+        seconds = patience + self._limits.time(case.megabytes)
         memory = self._limits.memory(case.megabytes) + HEADROOM
         place = Path(self._folder.name)
         _write(place, case)
@@ -139,8 +142,6 @@ def _arguments(case: Case, options: tuple[str, ...]) -> list[str]:
 
 def _write(place: Path, case: Case) -> None:
     """Put a case's files into an empty folder, and an empty folder for outputs beside them."""
-    import shutil
-
     for old in place.iterdir():
         if old.name not in ("stdout", "stderr"):
             shutil.rmtree(old) if old.is_dir() else old.unlink()
