@@ -44,10 +44,10 @@ WARM_UP = ("mcap", "mcap-lz4", "mcap-unindexed", "bag-bz2", "bag-lz4", "db3.zstd
 WARM_OPTIONS = tuple(
     tuple(words.split())
     for words in (
-        "--no-detect --mapper det,prob,forward",
+        "--no-detect --mapper prob",
+        "--no-detect --mapper forward",
         "--no-detect --pose fused --match-scans",
         "--no-detect --pose tf",
-        "--no-detect --pose scans",
         "--pose odom",
     )
 )

@@ -9,6 +9,7 @@ from typing import NamedTuple
 
 from bench.fuzzing.case import Case, Generator
 from bench.fuzzing.damage import damaged_bytes
+from bench.fuzzing.messages import wild_messages
 from bench.fuzzing.records import damaged_records
 from bench.fuzzing.samples import Samples
 from bench.fuzzing.summaries import lying_summary
@@ -36,6 +37,7 @@ KINDS: Mapping[str, Kind] = {
         Kind("bytes", 30, damaged_bytes),
         Kind("records", 14, damaged_records),
         Kind("summaries", 20, lying_summary, lists=True),
+        Kind("messages", 14, wild_messages, lists=True),
     )
 }
 """All kinds by their names."""

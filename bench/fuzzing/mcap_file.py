@@ -69,6 +69,9 @@ DECOMPRESSORS = {
 }
 
 
+CHUNK = Chunk
+
+
 class Record(NamedTuple):
     """A record as it is stored."""
 
@@ -97,7 +100,10 @@ def join(records: Iterable[Record]) -> bytes:
 
 def decode(record: Record) -> Any:
     """Return a record's fields, as mcap's class of its kind."""
-    return CLASSES[record.opcode].read(ReadDataStream(BytesIO(record.body)))
+    stream = ReadDataStream(BytesIO(record.body))
+    if record.opcode == Opcode.MESSAGE:
+        return Message.read(stream, len(record.body))
+    return CLASSES[record.opcode].read(stream)
 
 
 def encode(fields: McapRecord) -> Record:
@@ -106,6 +112,11 @@ def encode(fields: McapRecord) -> Record:
     fields.write(builder)
     data = builder.end()  # type: ignore[no-untyped-call]
     return Record(data[0], data[PREFIX.size :])
+
+
+def unpacked(chunk: Chunk) -> bytes:
+    """Return the records of a chunk, joined."""
+    return bytes(DECOMPRESSORS[chunk.compression](chunk.data))
 
 
 class Summary(NamedTuple):
