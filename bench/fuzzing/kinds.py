@@ -7,9 +7,13 @@ import random
 from collections.abc import Iterable, Mapping
 from typing import NamedTuple
 
+from bench.fuzzing.bombs import bomb
 from bench.fuzzing.case import Case, Generator
+from bench.fuzzing.channels import hostile_channels
 from bench.fuzzing.damage import damaged_bytes
-from bench.fuzzing.messages import wild_messages
+from bench.fuzzing.documents import hostile_json
+from bench.fuzzing.foxglove_messages import wild_foxglove_messages
+from bench.fuzzing.messages import wild_ros_messages, wild_scans
 from bench.fuzzing.records import damaged_records
 from bench.fuzzing.samples import Samples
 from bench.fuzzing.summaries import lying_summary
@@ -37,7 +41,12 @@ KINDS: Mapping[str, Kind] = {
         Kind("bytes", 30, damaged_bytes),
         Kind("records", 14, damaged_records),
         Kind("summaries", 20, lying_summary, lists=True),
-        Kind("messages", 14, wild_messages, lists=True),
+        Kind("messages", 10, wild_ros_messages, lists=True),
+        Kind("foxglove", 4, wild_foxglove_messages),
+        Kind("scans", 2, wild_scans),
+        Kind("channels", 6, hostile_channels, lists=True),
+        Kind("json", 8, hostile_json),
+        Kind("bombs", 4, bomb, lists=True),
     )
 }
 """All kinds by their names."""

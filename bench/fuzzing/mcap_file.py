@@ -69,9 +69,6 @@ DECOMPRESSORS = {
 }
 
 
-CHUNK = Chunk
-
-
 class Record(NamedTuple):
     """A record as it is stored."""
 

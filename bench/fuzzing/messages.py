@@ -2,29 +2,23 @@
 
 from __future__ import annotations
 
-import json
 import math
 import random
 import struct
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import fields, is_dataclass
+from dataclasses import fields, is_dataclass, replace
 from functools import cache
 from typing import Any, NamedTuple
 
 import numpy as np
-from foxglove_schemas_protobuf.FrameTransform_pb2 import FrameTransform
-from foxglove_schemas_protobuf.FrameTransforms_pb2 import FrameTransforms
-from foxglove_schemas_protobuf.LaserScan_pb2 import LaserScan
 from mcap.records import Channel, Message, Schema
 from rosbags.typesys import Stores, get_typestore
 
-from bench.fuzzing import mcap_file
 from bench.fuzzing.case import Case
 from bench.fuzzing.mcap_file import Assembly
-from bench.fuzzing.samples import Sample, Samples
-from prim.log.decoding.cdr import SECOND
+from bench.fuzzing.samples import Samples
 from prim.log.decoding.ros import decode_scan
-from prim.log.messages import GPS_TOPIC, ODOM_TOPIC, SCAN_TOPIC, SCAN_TYPE
+from prim.log.messages import GPS_TOPIC, ODOM_TOPIC, SCAN_TOPIC, encode_scan
 from tests.encodings.content import LogContent
 from tests.encodings.ros1 import ros1_types
 
@@ -152,7 +146,7 @@ def wild_ros_messages(rng: random.Random, samples: Samples) -> Case:
     kind = types[topic]
     types[topic] = substitute.type if substitute else kind
     is_ros1 = rng.random() < 0.25 and not _is_new_in_ros2(types)
-    chosen = _chosen(rng, len(content.of(topic)))
+    chosen = chosen_messages(rng, len(content.of(topic)))
     done, messages, at = "", [], 0
     for message in content.messages:
         data: Any = message.data
@@ -178,8 +172,16 @@ def _is_new_in_ros2(types: dict[str, str]) -> bool:
     return bool({"visualization_msgs/msg/MarkerArray", "tf2_msgs/msg/TFMessage"} & set(types.values()))
 
 
-def _chosen(rng: random.Random, count: int) -> set[int]:
-    """Return which messages of a topic are damaged: one, some or all."""
+def chosen_messages(rng: random.Random, count: int) -> set[int]:
+    """Choose which messages of a topic are damaged: one, some or all.
+
+    Args:
+        rng: The source of randomness.
+        count: How many there are.
+
+    Returns:
+        Their indices.
+    """
     share = rng.choice((0.0, 0.0, 0.3, 1.0))
     return {rng.randrange(count)} | {k for k in range(count) if rng.random() < share}
 
@@ -244,7 +246,7 @@ class _Leaf(NamedTuple):
 
     def change(self, rng: random.Random) -> str:
         """Put something wild there; return what."""
-        value = _wild(rng, self.value)
+        value = wild_value(rng, self.value)
         self.put(value)
         shown = f"{len(value)} items" if isinstance(value, np.ndarray | list) else repr(value)[:40]
         return f"{self.path} = {shown}"
@@ -266,7 +268,16 @@ def _leaves(value: Any, path: str = "") -> Iterator[_Leaf]:
                 yield from _leaves(inner, f"{where}[{k}].")
 
 
-def _wild(rng: random.Random, value: Any) -> Any:
+def wild_value(rng: random.Random, value: Any) -> Any:
+    """Return a wild value of the same type.
+
+    Args:
+        rng: The source of randomness.
+        value: A number, text or sequence.
+
+    Returns:
+        The value.
+    """
     if isinstance(value, bool):
         return not value
     if isinstance(value, int):
@@ -294,9 +305,6 @@ def _wild_array(rng: random.Random, values: np.ndarray[Any, Any]) -> np.ndarray[
             is_real = changed.dtype.kind == "f"
             changed[k] = rng.choice(FLOATS_32) if is_real else rng.randrange(256)
     return changed
-
-
-LARGEST = {"u": (0, (1 << 32) - 1), "i": (-(1 << 31), (1 << 31) - 1)}
 
 
 def _serialized(value: Any, kind: str, is_ros1: bool) -> bytes:
@@ -342,142 +350,6 @@ def message_record(channel: int, log_time: int, data: bytes) -> Message:
     return Message(channel_id=channel, log_time=log_time, data=data, publish_time=log_time, sequence=0)
 
 
-def wild_foxglove_messages(rng: random.Random, samples: Samples) -> Case:
-    """Change messages of Foxglove's, in JSON or protobuf.
-
-    Args:
-        rng: The source of randomness.
-        samples: The intact logs.
-
-    Returns:
-        The case.
-    """
-    is_json = rng.random() < 0.5
-    sample = samples.by_name["foxglove-json" if is_json else "foxglove-protobuf"]
-    change = wild_json if is_json else _wild_protobuf
-    what, data = with_changed_messages(rng, sample, change)
-    options = ("--no-viewer", *rng.choice(MODES).split())
-    return Case(f"{sample.name}: {what}", {"log.mcap": data}, options=options)
-
-
-def with_changed_messages(
-    rng: random.Random, sample: Sample, change: Callable[[random.Random, str, bytes], tuple[str, bytes]]
-) -> tuple[str, bytes]:
-    """Return an MCAP sample in which some messages of a topic are changed, with indexes that fit.
-
-    Args:
-        rng: The source of randomness.
-        sample: The sample, in chunks.
-        change: From a topic and a message to what was done and the changed message.
-
-    Returns:
-        What was done, and the file.
-    """
-    size = len(mcap_file.MAGIC)
-    inner = [
-        mcap_file.decode(record)
-        for chunk in mcap_file.split(sample.data[size:-size])
-        if mcap_file.CLASSES.get(chunk.opcode) is mcap_file.CHUNK
-        for record in mcap_file.split(mcap_file.unpacked(mcap_file.decode(chunk)))
-    ]
-    topics = {record.id: record.topic for record in inner if isinstance(record, Channel)}
-    channel = rng.choice(list(topics))
-    own = [record for record in inner if isinstance(record, Message) and record.channel_id == channel]
-    chosen = _chosen(rng, len(own))
-    what, file = "", Assembly()
-    for number in chosen:
-        what, own[number].data = change(rng, topics[channel], own[number].data)
-    file.add(*inner)
-    return f"{len(chosen)} of {topics[channel]}: {what}", file.finish()
-
-
-JSON_VALUES: tuple[Any, ...] = (
-    None, True, False, 0, -1, 1e308, -1e308, 1 << 70, -(1 << 70), 10**400, "", "NaN", "Infinity", "x" * 2000, [], {}, [[]],
-    [None] * 50, {"sec": 1}, [1, "a"], "\x1b[2J", 1e-320, 2**63, 0.5, [1e308] * 3, {"x": {}}, "2024-13-01T00:00:00Z",
-)  # fmt: skip
-JSON_TEXTS = (
-    "1e999", "-1e999", "NaN", "Infinity", "9" * 5000, "[" * 100_000, "[" * 100_000 + "]" * 100_000, '{"a":' * 100_000,
-    "-0", "1.0e-999", '"\\ud800"', '"\\u0000"', "", "{", '"', "nul", "[1,]", "\ufeff{}",
-)  # fmt: skip
-MARK = "\u0001mark"
-"""Stands where a text of JSON is put that json itself would not write."""
-
-
-def wild_json(rng: random.Random, topic: str, data: bytes) -> tuple[str, bytes]:
-    """Change one value of a JSON text.
-
-    Args:
-        rng: The source of randomness.
-        topic: For what it is.
-        data: The text.
-
-    Returns:
-        What was done, and the text.
-    """
-    value = json.loads(data)
-    if rng.random() < 0.08:
-        text = rng.choice(JSON_TEXTS)
-        return f"{topic} is {text[:20]}", text.encode("utf-8", "surrogatepass")
-    places = list(_json_places(value))
-    path, holder, key = rng.choice(places)
-    if rng.random() < 0.2 and isinstance(holder, dict):
-        del holder[key]
-        return f"{path} left out", json.dumps(value).encode()
-    if rng.random() < 0.3:
-        text = rng.choice(JSON_TEXTS)
-        holder[key] = MARK
-        return f"{path} = {text[:20]}", json.dumps(value).replace(json.dumps(MARK), text).encode("utf-8", "surrogatepass")
-    holder[key] = rng.choice(JSON_VALUES)
-    return f"{path} = {str(holder[key])[:30]}", json.dumps(value).encode()
-
-
-def _json_places(value: Any, path: str = "") -> Iterator[tuple[str, Any, Any]]:
-    """Yield every value within a JSON value: where it is, what holds it, and its key there."""
-    items = value.items() if isinstance(value, dict) else enumerate(value) if isinstance(value, list) else ()
-    for key, item in items:
-        yield f"{path}.{key}", value, key
-        yield from _json_places(item, f"{path}.{key}")
-
-
-PROTOBUF_CLASSES = {"/scan": LaserScan, "/tf": FrameTransform, "/tf_static": FrameTransforms}
-
-
-def _wild_protobuf(rng: random.Random, topic: str, data: bytes) -> tuple[str, bytes]:
-    if rng.random() < 0.4:
-        return damaged_words(rng, data)
-    message = PROTOBUF_CLASSES[topic].FromString(data)
-    places = list(_protobuf_places(message))
-    path, holder, field = rng.choice(places)
-    value = getattr(holder, field.name)
-    if _is_repeated(value):
-        changed = rng.choice(([], [rng.choice(FLOATS) for _ in range(rng.choice(COUNTS))]))
-        del value[:]
-        value.extend(changed)
-        return f"{path} = {len(changed)} items", message.SerializeToString()
-    try:
-        setattr(holder, field.name, _wild(rng, value))
-    except (ValueError, TypeError):
-        setattr(holder, field.name, type(value)())
-    return f"{path} = {getattr(holder, field.name)!r:.40}", message.SerializeToString()
-
-
-def _is_repeated(value: Any) -> bool:
-    return hasattr(value, "extend")
-
-
-def _protobuf_places(message: Any, path: str = "") -> Iterator[tuple[str, Any, Any]]:
-    """Yield the fields of a protobuf message that are numbers, texts or sequences of numbers."""
-    for field in message.DESCRIPTOR.fields:
-        value = getattr(message, field.name)
-        if field.message_type is None:
-            yield f"{path}{field.name}", message, field
-        elif _is_repeated(value):
-            for item in value:
-                yield from _protobuf_places(item, f"{path}{field.name}.")
-        else:
-            yield from _protobuf_places(value, f"{path}{field.name}.")
-
-
 def wild_scans(rng: random.Random, samples: Samples) -> Case:
     """Make scans of many beams or long ranges, as a stranger's scanner has them: nothing is damaged.
 
@@ -488,10 +360,6 @@ def wild_scans(rng: random.Random, samples: Samples) -> Case:
     Returns:
         The case.
     """
-    from dataclasses import replace
-
-    from prim.log.messages import encode_scan
-
     content = samples.content
     far, share = rng.choice((1e2, 3e3, 1e5, 1e7, 1e20)), rng.choice((0.02, 0.3, 1.0))
     beams = rng.choice((1, 2, 25, 1000, 20_000))
@@ -508,11 +376,3 @@ def wild_scans(rng: random.Random, samples: Samples) -> Case:
     what = f"{beams} beams, {share:.0%} of them {far:g} m"
     options = ("--no-viewer", *rng.choice(MODES).split())
     return Case(what, {"log.mcap": _mcap(content, content.types, messages, False)}, options=options)
-
-
-def wild_messages(rng: random.Random, samples: Samples) -> Case:
-    """See :func:`wild_ros_messages`, :func:`wild_foxglove_messages` and :func:`wild_scans`."""
-    return rng.choices((wild_ros_messages, wild_foxglove_messages, wild_scans), (7, 2, 1))[0](rng, samples)
-
-
-__all__ = ["JSON_TEXTS", "SCAN_TYPE", "SECOND", "wild_json", "wild_message", "wild_messages"]
