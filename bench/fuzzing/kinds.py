@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib
 import random
 from collections.abc import Iterable, Mapping
 from typing import NamedTuple
@@ -14,6 +13,7 @@ from bench.fuzzing.damage import damaged_bytes
 from bench.fuzzing.documents import hostile_json
 from bench.fuzzing.foxglove_messages import wild_foxglove_messages
 from bench.fuzzing.messages import wild_ros_messages, wild_scans
+from bench.fuzzing.others import MODULES, hostile_log, hostile_network, is_there
 from bench.fuzzing.records import damaged_records
 from bench.fuzzing.samples import Samples
 from bench.fuzzing.summaries import lying_summary
@@ -47,9 +47,12 @@ KINDS: Mapping[str, Kind] = {
         Kind("channels", 6, hostile_channels, lists=True),
         Kind("json", 8, hostile_json),
         Kind("bombs", 4, bomb, lists=True),
+        Kind("formats", 10, hostile_log),
+        Kind("weights", 3, hostile_network),
     )
+    if kind.name not in MODULES or is_there(kind.name)
 }
-"""All kinds by their names."""
+"""All kinds by their names; those whose module is not there are left out."""
 
 
 def make_case(kind: str, number: int, seed: int, samples: Samples) -> Case:

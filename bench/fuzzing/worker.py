@@ -27,7 +27,7 @@ Command = Callable[[list[str]], int]
 
 OUTPUTS = {"--map": "out/m", "--trajectory": "out/t.tum", "--report": "out/r.json"}
 COMPARED = ("m.pgm", "t.tum")
-PRINTED = 1 << 20
+PRINTED = 1 << 26
 """So much of what is printed is looked at (bytes)."""
 KILOBYTE = 1024
 """The unit of the system's figure of peak memory on Linux (bytes)."""
