@@ -142,20 +142,30 @@ class Fuzzer:
         case = case if case.options else replace(case, options=FAST)
         worker = self._workers.get()
         try:
-            whole = self._content(worker, case.sample)
+            whole = self._content_of(worker, case.sample)
             runs = [(), (RECOVER,), *([(LISTING, "--json")] if KINDS[kind].lists else [])]
             outcomes = [worker.run(case, options) for options in runs]
         finally:
             self._workers.put(worker)
-        findings = [_finding(outcome, found) for outcome in outcomes if (found := self._problem(case, outcome, whole))]
+        findings = [
+            _finding(outcome, found) for outcome in outcomes if (found := self._problem(case, outcome, whole))
+        ]
         codes = tuple(outcome.ending.split(":")[0] or str(outcome.code) for outcome in outcomes)
         return Result(kind, number, case.what, codes, tuple(findings)), case
 
     def _problem(self, case: Case, outcome: Outcome, whole: set[str]) -> str:
         return problem(case, outcome, whole, self._limits)
 
-    def _content(self, worker: Worker, name: str) -> set[str]:
+    def content(self, name: str) -> set[str]:
         """Return the contents of a sample, read plainly and to recover it. Raises RuntimeError where it has none."""
+        worker = self._workers.get()
+        try:
+            return self._content_of(worker, name)
+        finally:
+            self._workers.put(worker)
+
+    def _content_of(self, worker: Worker, name: str) -> set[str]:
+        """See :meth:`content`; of no sample, nothing."""
         if name and name not in self._contents:
             outcomes = [worker.run(_intact(self._samples, name), options) for options in ((), (RECOVER,))]
             self._contents[name] = {outcome.content for outcome in outcomes if outcome.content}
@@ -192,7 +202,7 @@ class Stream:
             self.results = [
                 Result(r["kind"], r["number"], r["what"], tuple(r["codes"]), tuple(r["findings"])) for r in read[1:]
             ]
-        self._stream = path.open("w", encoding="utf-8")
+        path.write_text("", encoding="utf-8")
         self._write(run)
         for result in self.results:
             self._write(vars(result))
@@ -202,14 +212,13 @@ class Stream:
         self.results.append(result)
         self._write(vars(result))
 
-    def close(self) -> None:
+    def complete(self) -> None:
         """Note that the run is complete: the next one begins anew."""
         self._write({"done": True})
-        self._stream.close()
 
     def _write(self, value: dict[str, Any]) -> None:
-        self._stream.write(json.dumps(value) + "\n")
-        self._stream.flush()
+        with self.path.open("a", encoding="utf-8") as stream:
+            stream.write(json.dumps(value) + "\n")
 
 
 def _parsed(line: str) -> Any:
@@ -267,7 +276,11 @@ def main() -> int:
 def _run_one(fuzzer: Fuzzer, options: argparse.Namespace) -> int:
     kind, number = options.case.split(":")
     result, case = fuzzer.run_one(kind, int(number))
-    print(printable(f"{options.case}: {result.what}; options {' '.join(case.options)}; exit codes {', '.join(result.codes)}"))
+    print(
+        printable(
+            f"{options.case}: {result.what}; options {' '.join(case.options)}; exit codes {', '.join(result.codes)}"
+        )
+    )
     for line in result.lines(options.seed):
         print(line)
     if options.keep:
@@ -291,10 +304,12 @@ def _run_all(fuzzer: Fuzzer, options: argparse.Namespace) -> int:
             print(line, flush=True)
         if result.findings and options.keep:
             keep(options.keep, result, case)
-    stream.close()
+    stream.complete()
     print("\n".join(summary(stream.results)))
     found = sum(bool(result.findings) for result in stream.results)
-    print(f"{found} of {len(stream.results)} cases have findings ({time.monotonic() - began:.0f} s; results in {path})")
+    print(
+        f"{found} of {len(stream.results)} cases have findings ({time.monotonic() - began:.0f} s; results in {path})"
+    )
     return 1 if found else 0
 
 

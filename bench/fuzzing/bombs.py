@@ -150,7 +150,11 @@ def _zero_chunk(rng: random.Random, samples: Samples) -> tuple[str, str, bytes]:
         size, data = packed, bytes(packed)
     claim = _wild_claim(rng, size)
     file = _chunk_file(rng, samples, _chunk(compression, data, claim, rng.choice((0, 0, 1))))
-    return f"a chunk of {size / 1e6:.0f} MB of zeros in {compression or 'nothing'}, that claims {claim}", "log.mcap", file
+    return (
+        f"a chunk of {size / 1e6:.0f} MB of zeros in {compression or 'nothing'}, that claims {claim}",
+        "log.mcap",
+        file,
+    )
 
 
 def _tiny_chunk(rng: random.Random, samples: Samples) -> tuple[str, str, bytes]:
@@ -203,7 +207,11 @@ def _zero_bag(rng: random.Random, samples: Samples) -> tuple[str, str, bytes]:
     intact = samples.by_name["bag"].data
     head_end = len(BAG_MAGIC) + 4096
     file = rng.choice((BAG_MAGIC + chunk, intact[:head_end] + chunk + intact[head_end:], intact + chunk))
-    return f"a bag's chunk of {size / 1e6:.0f} MB of zeros in {compression.decode()}, that claims {claim}", "log.bag", file
+    return (
+        f"a bag's chunk of {size / 1e6:.0f} MB of zeros in {compression.decode()}, that claims {claim}",
+        "log.bag",
+        file,
+    )
 
 
 def _packed_message(rng: random.Random, samples: Samples) -> tuple[str, str, bytes]:

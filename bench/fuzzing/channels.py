@@ -132,7 +132,9 @@ def _same_number(rng: random.Random, file: Assembly, content: LogContent) -> str
     number = rng.randrange(1, len(content.types) + 1)
     record: Channel | Schema
     if rng.random() < 0.5:
-        record = _described(number, rng.choice((*content.types, "/other")), "", rng.choice(ENCODINGS), rng.randrange(9))
+        record = _described(
+            number, rng.choice((*content.types, "/other")), "", rng.choice(ENCODINGS), rng.randrange(9)
+        )
     else:
         record = _schema(number, rng.choice((*content.types.values(), *TYPES)), data=rng.randbytes(10))
     when = rng.choice(("before", "amid", "after"))
@@ -159,7 +161,9 @@ def _missing_schemas(rng: random.Random, file: Assembly, content: LogContent) ->
     lost = rng.choice((None, *numbers))  # a channel whose messages belong to no channel at all
     for topic, log_time, data in content.messages:
         file.add(message_record(60_000 if topic == lost else numbers[topic], log_time, data))
-    return f"schema {schema} of {', '.join(sorted(chosen))} is missing" + (f", the channel of {lost}, too" if lost else "")
+    return f"schema {schema} of {', '.join(sorted(chosen))} is missing" + (
+        f", the channel of {lost}, too" if lost else ""
+    )
 
 
 def _odd_encodings(rng: random.Random, file: Assembly, content: LogContent) -> str:
@@ -182,6 +186,8 @@ def _odd_metadata(rng: random.Random, file: Assembly, content: LogContent) -> st
     names = NAMES if count < 100 else [name for name in NAMES if len(name) < 100]
     for number in range(count):
         name = rng.choice(("prim", "prim", *names, str(number)))
-        file.add(Metadata(metadata={rng.choice(names): rng.choice(names) for _ in range(rng.randrange(5))}, name=name))
+        file.add(
+            Metadata(metadata={rng.choice(names): rng.choice(names) for _ in range(rng.randrange(5))}, name=name)
+        )
     _add_content(file, content)
     return f"{count} odd metadata records"

@@ -118,7 +118,9 @@ def damaged_bytes(rng: random.Random, samples: Samples) -> Case:
     sample = rng.choice(list(samples.by_name.values()))
     name = rng.choice(list(sample.files))
     data, done = sample.files[name], []
-    changes = rng.choices(list(CHANGES), list(CHANGES.values()), k=1 if rng.random() < SINGLE else rng.randrange(2, 4))
+    changes = rng.choices(
+        list(CHANGES), list(CHANGES.values()), k=1 if rng.random() < SINGLE else rng.randrange(2, 4)
+    )
     for change in changes:
         if len(data) > 1:
             what, data = change(rng, data)

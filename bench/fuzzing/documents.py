@@ -16,9 +16,30 @@ from bench.fuzzing.samples import Samples
 from prim.log.messages import TRUE_PRIMITIVES_TOPIC
 
 MANY_PRIMITIVES = (1_000, 100_000)
-MODES = ("--no-detect --mapper det", "--no-detect --mapper prob", "--no-detect --mapper det --pose odom", "--mapper prob")
+MODES = (
+    "--no-detect --mapper det",
+    "--no-detect --mapper prob",
+    "--no-detect --mapper det --pose odom",
+    "--mapper prob",
+)
 """Options with which such logs are replayed; only the last one compares what is found with the primitives."""
-NUMBERS = ("1e999", "-1", "0", "NaN", "9" * 400, "1e308", "true", "null", "[]", "{}", '"0.05"', "", "\x1b[2J", "0.05\n", " 1 ")
+NUMBERS = (
+    "1e999",
+    "-1",
+    "0",
+    "NaN",
+    "9" * 400,
+    "1e308",
+    "true",
+    "null",
+    "[]",
+    "{}",
+    '"0.05"',
+    "",
+    "\x1b[2J",
+    "0.05\n",
+    " 1 ",
+)
 """Values of the recorder's metadata, which are texts."""
 
 

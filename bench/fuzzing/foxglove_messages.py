@@ -117,7 +117,9 @@ def wild_json(rng: random.Random, topic: str, data: bytes) -> tuple[str, bytes]:
     if rng.random() < 0.3:
         text = rng.choice(JSON_TEXTS)
         holder[key] = MARK
-        return f"{path} = {text[:20]}", json.dumps(value).replace(json.dumps(MARK), text).encode("utf-8", "surrogatepass")
+        return f"{path} = {text[:20]}", json.dumps(value).replace(json.dumps(MARK), text).encode(
+            "utf-8", "surrogatepass"
+        )
     holder[key] = rng.choice(JSON_VALUES)
     return f"{path} = {str(holder[key])[:30]}", json.dumps(value).encode()
 

@@ -54,7 +54,7 @@ class Outcome:
         content: A digest of its map and trajectory, and of what its report says of the log, the poses and the map;
             empty where there is no report.
         seconds: Its CPU time (s).
-        megabytes: The process' peak memory (MB), where this run raised it; else 0.
+        megabytes: The process' peak memory (MB) in this run; 0 where the system cannot say.
     """
 
     options: tuple[str, ...] = ()
@@ -111,7 +111,7 @@ def _in_output(case: Case, outcome: Outcome) -> str:
         return "an unexpected exception"
     control = next((c for c in text if not c.isprintable() and c != "\n"), "")
     if control:
-        return f"a raw control character is printed: {ascii(control)}"
+        return f"a raw control character is printed: {control!a}"
     if outcome.code not in (0, 1, 3) and not (case.may_refuse and outcome.code == 2):
         return f"exit code {outcome.code}"
     if len(lines) != (outcome.code in (1, 2)):

@@ -29,7 +29,20 @@ FLOATS = (
 INTEGERS = (
     0, 1, -1, 2, 7, 100, 255, 65535, 65536, 1 << 20, (1 << 31) - 1, -(1 << 31), 1 << 31, (1 << 32) - 1, (1 << 63) - 1, 1 << 62,
 )  # fmt: skip
-STRINGS = ("", "laser", "base_link", "odom", "map", "/", "a" * 5000, "é\u202e\x1b[2J\n", "\x00", "{}", "[" * 3000, "NaN")
+STRINGS = (
+    "",
+    "laser",
+    "base_link",
+    "odom",
+    "map",
+    "/",
+    "a" * 5000,
+    "é\u202e\x1b[2J\n",
+    "\x00",
+    "{}",
+    "[" * 3000,
+    "NaN",
+)
 COUNTS = (0, 1, 2, 1000)
 """Of the items that sequences get."""
 
@@ -73,7 +86,9 @@ def _new(type_name: str, **values: Any) -> Any:
 
 def _multi_echo(scan: Any) -> Any:
     echo = "sensor_msgs/msg/LaserEcho"
-    shared = {f.name: getattr(scan, f.name) for f in fields(scan) if f.name not in ("ranges", "intensities", "__msgtype__")}
+    shared = {
+        f.name: getattr(scan, f.name) for f in fields(scan) if f.name not in ("ranges", "intensities", "__msgtype__")
+    }
     ranges = [_new(echo, echoes=np.array([z], np.float32)) for z in scan.ranges]
     return _new("sensor_msgs/msg/MultiEchoLaserScan", **shared, ranges=ranges, intensities=[])
 
@@ -83,7 +98,8 @@ def _cloud(scan: Any) -> Any:
     ranges = np.where(np.isfinite(scan.ranges), scan.ranges, np.nan)
     points = np.stack([ranges * np.cos(bearings), ranges * np.sin(bearings), 0 * ranges], axis=1).astype(np.float32)
     columns = [
-        _new("sensor_msgs/msg/PointField", name=axis, offset=4 * k, datatype=7, count=1) for k, axis in enumerate("xyz")
+        _new("sensor_msgs/msg/PointField", name=axis, offset=4 * k, datatype=7, count=1)
+        for k, axis in enumerate("xyz")
     ]
     return _new(
         "sensor_msgs/msg/PointCloud2",

@@ -14,7 +14,10 @@ from bench.fuzzing.case import Case
 from bench.fuzzing.samples import Samples
 from detect.networks.weights import DETECTOR_FILE, SHIPPED
 
-MODULES = {"weights": ("bench.fuzzing.networks", "hostile_networks"), "formats": ("bench.fuzzing.formats", "hostile_logs")}
+MODULES = {
+    "weights": ("bench.fuzzing.networks", "hostile_networks"),
+    "formats": ("bench.fuzzing.formats", "hostile_logs"),
+}
 """For each kind the module and its function: from a source of randomness to what was done, file names and bytes."""
 MOST = 1000
 """So many inputs of a function are chosen from."""
@@ -59,4 +62,6 @@ def hostile_network(rng: random.Random, samples: Samples) -> Case:
     name = name if name in _shipped() else DETECTOR_FILE
     networks = {f"weights/{file}": content for file, content in ({**_shipped(), name: data}).items()}
     options = ("--no-viewer", "--mapper", MAPPER, "--weights", "weights")
-    return Case(f"{name}: {what}", {"log.mcap": samples.by_name["mcap"].data, **networks}, "", options, may_refuse=True)
+    return Case(
+        f"{name}: {what}", {"log.mcap": samples.by_name["mcap"].data, **networks}, "", options, may_refuse=True
+    )

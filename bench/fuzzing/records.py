@@ -252,7 +252,9 @@ def _changed_data(rng: random.Random, records: list[Any]) -> tuple[str, list[Any
     data = bytearray(records[at].data)
     place = rng.randrange(max(1, len(data) // 4)) * 4
     word = data[place : place + 4]
-    data[place : place + 4] = wild_size(rng, int.from_bytes(word, "little"), 8 * len(word)).to_bytes(len(word), "little")
+    data[place : place + 4] = wild_size(rng, int.from_bytes(word, "little"), 8 * len(word)).to_bytes(
+        len(word), "little"
+    )
     records[at] = records[at]._replace(data=bytes(data))
     return f"record {at} has {data[place : place + 4].hex()} at byte {place} of its data", records
 

@@ -100,7 +100,9 @@ def make_samples(seed: int = 0) -> Samples:
             found[encoding.name] = _files(encoding.write(content, place / encoding.name))
         found |= {name: {"log.mcap": data} for name, data in _further_mcaps(content).items()}
         found[PART] = {"log.mcap.part": _killed_recording(content, place / "killed.mcap")}
-    samples = {name: Sample(name, files, _is_checked(name), not _is_plain_text(name)) for name, files in found.items()}
+    samples = {
+        name: Sample(name, files, _is_checked(name), not _is_plain_text(name)) for name, files in found.items()
+    }
     return Samples(content, samples)
 
 

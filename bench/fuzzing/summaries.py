@@ -16,7 +16,20 @@ from bench.fuzzing.mcap_file import Record
 from bench.fuzzing.records import wild_size
 from bench.fuzzing.samples import Samples
 
-TEXTS = ("", "/scan", "/odom", "world.json", "prim", "cdr", "zstd", "lz4", "none", "é" * 300, "\x1b]0;x\x07\u202e", "x" * 70000)
+TEXTS = (
+    "",
+    "/scan",
+    "/odom",
+    "world.json",
+    "prim",
+    "cdr",
+    "zstd",
+    "lz4",
+    "none",
+    "é" * 300,
+    "\x1b]0;x\x07\u202e",
+    "x" * 70000,
+)
 """What texts are changed to, beside those of other records."""
 
 WIDTHS = (64, 32, 16, 8)
