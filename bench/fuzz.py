@@ -28,7 +28,7 @@ from queue import SimpleQueue
 from typing import Any
 
 from bench.fuzzing.case import Case
-from bench.fuzzing.judge import LISTING, RECOVER, Limits, Outcome, problem
+from bench.fuzzing.judge import LIMITS, LISTING, RECOVER, Limits, Outcome, problem
 from bench.fuzzing.kinds import KINDS, make_case, plan
 from bench.fuzzing.samples import Samples, make_samples
 from bench.fuzzing.worker import Command, Worker, replay_command
@@ -37,8 +37,10 @@ from prim.text import printable
 FAST = ("--mapper", "det", "--no-viewer", "--no-detect")
 """Options of cases that have none of their own."""
 
-WARM_UP = ("mcap", "mcap-lz4", "mcap-unindexed", "bag-bz2", "bag-lz4", "db3.zstd", "foxglove-json", "foxglove-protobuf",
-           "carmen-flaser-gz", "mcap-split", "part")  # fmt: skip
+WARM_UP = (
+    "mcap", "mcap-lz4", "mcap-unindexed", "bag-bz2", "bag-lz4", "db3.zstd", "foxglove-json", "foxglove-protobuf",
+    "carmen-flaser-gz", "mcap-split", "part",
+)  # fmt: skip
 """Samples that a worker replays before any case."""
 
 WARM_OPTIONS = tuple(
@@ -99,7 +101,7 @@ class Fuzzer:
         seed: int = 0,
         jobs: int = 1,
         command: Command = replay_command,
-        limits: Limits = Limits(),
+        limits: Limits = LIMITS,
     ) -> None:
         self._samples, self._seed, self._jobs, self._limits = samples, seed, jobs, limits
         self._stack = ExitStack()

@@ -1,4 +1,4 @@
-"""Small inputs that claim or become much: zeros and tiny records, in every compression, with true and lying claims."""
+"""Small inputs that claim or become much: zeros and tiny records, in every compression; claims that are true or lie."""
 
 from __future__ import annotations
 

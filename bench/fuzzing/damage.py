@@ -74,7 +74,7 @@ def swap(rng: random.Random, data: bytes) -> tuple[str, bytes]:
 
 def insert(rng: random.Random, data: bytes) -> tuple[str, bytes]:
     """Insert bytes, at random or as they stand elsewhere."""
-    at, piece = _piece(rng, data)
+    _, piece = _piece(rng, data)
     added = rng.choice((piece, rng.randbytes(len(piece)), b"\xff" * len(piece)))
     where = rng.randrange(len(data) + 1)
     return f"{len(added)} bytes inserted at {where}", data[:where] + added + data[where:]
@@ -144,7 +144,7 @@ def _is_seen(sample: Sample, name: str, data: bytes, changes: list[Change]) -> b
 
 
 def _changes_opcode(before: bytes, after: bytes) -> bool:
-    """Return whether the opcode of any record of an MCAP file is another one, and nothing else that says where it ends."""
+    """Return whether the opcode of any record of an MCAP file is another one."""
     at = len(mcap_file.MAGIC)
     while at < len(before) - len(mcap_file.MAGIC):
         _, length = mcap_file.PREFIX.unpack_from(before, at)

@@ -40,6 +40,9 @@ class Limits:
         return self.megabytes + self.megabytes_per_megabyte * megabytes
 
 
+LIMITS = Limits()
+
+
 @dataclass(frozen=True)
 class Outcome:
     """What a run did.
@@ -94,14 +97,13 @@ def problem(case: Case, outcome: Outcome, whole: Container[str], limits: Limits)
     Returns:
         The finding; empty where there is none.
     """
-    found = (
+    return (
         outcome.ending
         or _in_output(case, outcome)
         or outcome.report
         or _in_content(case, outcome, whole)
         or _in_effort(case, outcome, limits)
     )
-    return found
 
 
 def _in_output(case: Case, outcome: Outcome) -> str:

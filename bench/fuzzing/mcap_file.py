@@ -1,4 +1,4 @@
-"""MCAP files in pieces (https://mcap.dev/spec): taken apart, changed, and put together with offsets and CRCs right."""
+"""MCAP files in pieces (https://mcap.dev/spec): taken apart, and put together with offsets and CRCs right."""
 
 from __future__ import annotations
 
@@ -192,6 +192,9 @@ class Chunked(NamedTuple):
     has_crc: bool = True
 
 
+CHUNKED = Chunked()
+
+
 class Assembly:
     """Puts records together as they are, however they contradict each other, and indexes them.
 
@@ -200,7 +203,7 @@ class Assembly:
         profile: The header's profile.
     """
 
-    def __init__(self, chunked: Chunked = Chunked(), profile: str = "ros2") -> None:
+    def __init__(self, chunked: Chunked = CHUNKED, profile: str = "ros2") -> None:
         self._chunked = chunked
         self._data = bytearray(MAGIC + encode(Header(profile=profile, library="fuzz")).packed())
         self._chunk = bytearray()

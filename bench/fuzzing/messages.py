@@ -23,11 +23,12 @@ from tests.encodings.content import LogContent
 from tests.encodings.ros1 import ros1_types
 
 FLOATS = (
-    math.nan, math.inf, -math.inf, 0.0, -0.0, 1e30, -1e30, 1e300, -1e308, 5e-324, 1e-310, 1e-40, 1e9, 1e12, -1e12, 3.4e38,
-    2.0**31, 2.0**63, 1.0, -1.0, math.pi, 1e5, 3e3,
+    math.nan, math.inf, -math.inf, 0.0, -0.0, 1e30, -1e30, 1e300, -1e308, 5e-324, 1e-310, 1e-40, 1e9, 1e12, -1e12,
+    3.4e38, 2.0**31, 2.0**63, 1.0, -1.0, math.pi, 1e5, 3e3,
 )  # fmt: skip
 INTEGERS = (
-    0, 1, -1, 2, 7, 100, 255, 65535, 65536, 1 << 20, (1 << 31) - 1, -(1 << 31), 1 << 31, (1 << 32) - 1, (1 << 63) - 1, 1 << 62,
+    0, 1, -1, 2, 7, 100, 255, 65535, 65536, 1 << 20, (1 << 31) - 1, -(1 << 31), 1 << 31, (1 << 32) - 1, (1 << 63) - 1,
+    1 << 62,
 )  # fmt: skip
 STRINGS = (
     "",

@@ -1,4 +1,4 @@
-"""Worker processes that run a command again and again, each time with all that it prints, takes and leaves measured."""
+"""Worker processes that run a command again and again, and measure what it prints, takes and leaves."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from tempfile import TemporaryDirectory
 from typing import Any, NoReturn
 
 from bench.fuzzing.case import MEGABYTE, Case
-from bench.fuzzing.judge import LISTING, Limits, Outcome, is_slow
+from bench.fuzzing.judge import LIMITS, LISTING, Limits, Outcome, is_slow
 
 Command = Callable[[list[str]], int]
 """What is fuzzed: takes arguments, returns an exit code. Workers import it by its name."""
@@ -54,7 +54,7 @@ class Worker:
         limits: What a run may take.
     """
 
-    def __init__(self, command: Command, warm_up: Sequence[Case] = (), limits: Limits = Limits()) -> None:
+    def __init__(self, command: Command, warm_up: Sequence[Case] = (), limits: Limits = LIMITS) -> None:
         self._command, self._warm_up, self._limits = command, warm_up, limits
         self._folder = TemporaryDirectory(prefix="prim-fuzz-", ignore_cleanup_errors=True)
         self._process: Any = None
@@ -227,7 +227,7 @@ def _peak() -> float:
 
 
 def _limit(seconds: float, megabytes: float) -> None:
-    """Let the system end this process at a CPU time (s), and refuse it memory beyond what it has and ``megabytes``."""
+    """Let the system end this process at a CPU time (s), and refuse it more memory than ``megabytes`` beside its own."""
     hard = resource.getrlimit(resource.RLIMIT_CPU)[1]
     resource.setrlimit(
         resource.RLIMIT_CPU, (resource.RLIM_INFINITY if math.isinf(seconds) else math.ceil(seconds), hard)
