@@ -1,4 +1,4 @@
-"""Small inputs that claim or become much: zeros and tiny records, in every compression; claims that are true or lie."""
+"""Small inputs that claim or become much: zeros and tiny records, in every compression, their claims true or not."""
 
 from __future__ import annotations
 

@@ -227,7 +227,7 @@ def _peak() -> float:
 
 
 def _limit(seconds: float, megabytes: float) -> None:
-    """Let the system end this process at a CPU time (s), and refuse it more memory than ``megabytes`` beside its own."""
+    """Let the system end this process at a CPU time (s), and refuse it ``megabytes`` beside what it has."""
     hard = resource.getrlimit(resource.RLIMIT_CPU)[1]
     resource.setrlimit(
         resource.RLIMIT_CPU, (resource.RLIM_INFINITY if math.isinf(seconds) else math.ceil(seconds), hard)
