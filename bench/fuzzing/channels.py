@@ -15,16 +15,16 @@ from tests.encodings.content import LogContent
 
 NAMES = (
     "", "/", "//", " ", "scan", "/scan ", "/SCAN", "/scan\x00", "\x1b[2J\x1b]0;title\x07", "\u202e/nacs",
-    "\u2028/a\u2029b", "\x85", "/a\nb\rc\td", "é" * 2000, "/" + "x" * 70_000, "'; rm -rf /; '", "$(id)", "{0}{path}", "%s%n",
-    "[red]/scan[/red]", "\ud7ff", "-h", "--force", "/e\u0301", "\ufeff/scan", "🤖",
+    "\u2028/a\u2029b", "\x85", "/a\nb\rc\td", "é" * 2000, "/" + "x" * 70_000, "'; rm -rf /; '", "$(id)", "{0}{path}",
+    "%s%n", "[red]/scan[/red]", "\ud7ff", "-h", "--force", "/e\u0301", "\ufeff/scan", "🤖",
 )  # fmt: skip
 """Names of topics, types and encodings."""
 
 ENCODINGS = ("", "cdr", "ros1", "json", "protobuf", "cbor", "CDR", "\x1b[31mcdr", "x" * 70_000)
 TYPES = (
     "", "sensor_msgs/msg/LaserScan", "sensor_msgs/LaserScan", "foxglove.LaserScan", "foxglove.",
-    "nav_msgs/msg/Odometry", "tf2_msgs/msg/TFMessage", "a/b", "a/b/c/d", "sensor_msgs/msg/PointCloud2", "\x1b[2J/msg/x",
-    "x" * 70_000,
+    "nav_msgs/msg/Odometry", "tf2_msgs/msg/TFMessage", "a/b", "a/b/c/d", "sensor_msgs/msg/PointCloud2",
+    "\x1b[2J/msg/x", "x" * 70_000,
 )  # fmt: skip
 
 MANY = (10, 300, 5_000, 60_000)

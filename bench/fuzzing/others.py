@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterable
 from functools import cache
 from importlib.util import find_spec
 from itertools import islice
+from pathlib import Path
 from typing import Any
 
 from bench.fuzzing.case import Case
@@ -18,9 +19,10 @@ MODULES = {
     "weights": ("bench.fuzzing.networks", "hostile_networks"),
     "formats": ("bench.fuzzing.formats", "hostile_logs"),
 }
-"""For each kind the module and its function: from a source of randomness to what was done, file names and bytes."""
-MOST = 1000
-"""So many inputs of a function are chosen from."""
+"""For each kind the module and its function: from a source of randomness to inputs without end, each what it is and
+its bytes, or what it is, its file's name and its bytes."""
+MOST = 40
+"""One of so many inputs of a function is taken."""
 MAPPER = "prob"
 """The mapper whose networks are replaced."""
 
@@ -30,16 +32,16 @@ def is_there(kind: str) -> bool:
     return find_spec(MODULES[kind][0]) is not None
 
 
-def _made(kind: str, rng: random.Random) -> tuple[str, str, bytes]:
+def _made(kind: str, rng: random.Random, default_name: str) -> tuple[str, str, bytes]:
     module, name = MODULES[kind]
     make: Callable[[random.Random], Iterable[Any]] = getattr(importlib.import_module(module), name)
-    what, file, data = rng.choice(list(islice(make(rng), MOST)))
-    return what, file, data
+    what, *names, data = rng.choice(list(islice(make(rng), MOST)))
+    return what, names[0] if names else default_name, data
 
 
 def hostile_log(rng: random.Random, samples: Samples) -> Case:
     """Return a log of ``hostile_logs``, see :data:`MODULES`; the samples are not used."""
-    what, name, data = _made("formats", rng)
+    what, name, data = _made("formats", rng, "log")
     return Case(what, {name: data})
 
 
@@ -58,8 +60,8 @@ def hostile_network(rng: random.Random, samples: Samples) -> Case:
     Returns:
         The case.
     """
-    what, name, data = _made("weights", rng)
-    name = name if name in _shipped() else DETECTOR_FILE
+    what, name, data = _made("weights", rng, DETECTOR_FILE)
+    name = next((file for file in _shipped() if what.startswith(Path(file).stem)), name)
     networks = {f"weights/{file}": content for file, content in ({**_shipped(), name: data}).items()}
     options = ("--no-viewer", "--mapper", MAPPER, "--weights", "weights")
     return Case(
