@@ -6,8 +6,9 @@ import struct
 import zlib
 from collections import defaultdict
 from collections.abc import Iterable, Sequence
+from dataclasses import replace
 from io import BytesIO
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Protocol
 
 import lz4.frame
 import zstandard
@@ -69,6 +70,14 @@ DECOMPRESSORS = {
 }
 
 
+class Packable(Protocol):
+    """A record that knows its bytes."""
+
+    def packed(self) -> bytes:
+        """Return its bytes."""
+        ...
+
+
 class Record(NamedTuple):
     """A record as it is stored."""
 
@@ -90,7 +99,7 @@ def split(data: bytes) -> list[Record]:
     return records
 
 
-def join(records: Iterable[Record]) -> bytes:
+def join(records: Iterable[Packable]) -> bytes:
     """Invert :func:`split`."""
     return b"".join(record.packed() for record in records)
 
@@ -114,6 +123,22 @@ def encode(fields: McapRecord) -> Record:
 def unpacked(chunk: Chunk) -> bytes:
     """Return the records of a chunk, joined."""
     return bytes(DECOMPRESSORS[chunk.compression](chunk.data))
+
+
+def repacked(chunk: Chunk, records: Iterable[Packable]) -> Chunk:
+    """Return a chunk that holds other records, with a CRC that is right if it had one.
+
+    Args:
+        chunk: The chunk.
+        records: The records.
+
+    Returns:
+        The chunk.
+    """
+    data = join(records)
+    crc = zlib.crc32(data) if chunk.uncompressed_crc else 0
+    packed = COMPRESSORS[chunk.compression](data)
+    return replace(chunk, data=packed, uncompressed_crc=crc, uncompressed_size=len(data))
 
 
 class Summary(NamedTuple):

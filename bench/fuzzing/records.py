@@ -5,10 +5,9 @@ from __future__ import annotations
 import bz2
 import random
 import struct
-import zlib
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from typing import Any, NamedTuple, Protocol, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import lz4.frame
 from mcap.opcode import Opcode
@@ -22,15 +21,7 @@ BAG_MAGIC = b"#ROSBAG V2.0\n"
 _LENGTH = struct.Struct("<I")
 
 
-class Packable(Protocol):
-    """A record that knows its bytes."""
-
-    def packed(self) -> bytes:
-        """Return its bytes."""
-        ...
-
-
-P = TypeVar("P", bound=Packable)
+P = TypeVar("P", bound=mcap_file.Packable)
 
 
 class Piece(NamedTuple):
@@ -122,7 +113,7 @@ def damaged_mcap_records(rng: random.Random, samples: Samples) -> Case:
     if chunks and rng.random() < 0.5:
         at = rng.choice(chunks)
         what, chunk = _with_changed_chunk(rng, records[at], change)
-        what, data = f"in chunk {at}, {what}", _with_record(sample, records, at, chunk)
+        what, data = f"in chunk {at}, {what}", with_record(sample, records, at, chunk)
     else:
         what, records = change(rng, records)
         data = mcap_file.MAGIC + mcap_file.join(records) + mcap_file.MAGIC
@@ -132,15 +123,22 @@ def damaged_mcap_records(rng: random.Random, samples: Samples) -> Case:
 
 def _with_changed_chunk(rng: random.Random, record: mcap_file.Record, change: Callable[..., Any]) -> Any:
     chunk = mcap_file.decode(record)
-    what, records = change(rng, mcap_file.split(mcap_file.DECOMPRESSORS[chunk.compression](chunk.data)))
-    data = mcap_file.join(records)
-    crc = zlib.crc32(data) if chunk.uncompressed_crc else 0
-    packed = mcap_file.COMPRESSORS[chunk.compression](data)
-    return what, replace(chunk, data=packed, uncompressed_crc=crc, uncompressed_size=len(data))
+    what, records = change(rng, mcap_file.split(mcap_file.unpacked(chunk)))
+    return what, mcap_file.repacked(chunk, records)
 
 
-def _with_record(sample: Sample, records: list[mcap_file.Record], at: int, chunk: Any) -> bytes:
-    """Return the file with another chunk, its offsets moved in the summary if there is one."""
+def with_record(sample: Sample, records: list[mcap_file.Record], at: int, chunk: Any) -> bytes:
+    """Put another chunk into an MCAP file, and move the offsets in its summary if it has one.
+
+    Args:
+        sample: The file.
+        records: Its records.
+        at: Which one is replaced.
+        chunk: The chunk.
+
+    Returns:
+        The file.
+    """
     replaced = mcap_file.encode(chunk)
     start = len(mcap_file.MAGIC) + len(mcap_file.join(records[:at]))
     moved = len(replaced.body) - len(records[at].body)
