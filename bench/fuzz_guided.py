@@ -3,11 +3,11 @@
     pip install -e '.[fuzz]' -c constraints.txt
     python -m bench.fuzz_guided [--minutes 10] [--targets logs,codecs,documents,networks] [--seed 0] [--keep FOLDER]
 
-Each target of bench.fuzzing.targets runs for its share of the minutes in a process of its own, on a corpus that begins
-with the small logs of bench.fuzzing.samples and grows in a temporary folder. Logs are changed by their structure, with
-CRCs that are right. A finding is an exception that the target does not expect, an input that takes more than 20 s or
-2 GB, or the end of the process; each is printed once, as one line, and --keep keeps its input, which
-`--input FILE --targets TARGET` runs again. Exits with 1 where there is any finding.
+Each target of bench.fuzzing.targets runs for its share of the minutes in a process of its own, on a corpus that
+begins with the small logs of bench.fuzzing.samples and grows in a temporary folder. Logs are changed by their
+structure, with CRCs that are right. A finding is an exception that the target does not expect, an input that takes
+more than 20 s or 2 GB, or the end of the process; each is printed once, as one line, and --keep keeps its input,
+which `--input FILE --targets TARGET` runs again. Exits with 1 where there is any finding.
 """
 
 from __future__ import annotations

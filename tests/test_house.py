@@ -73,7 +73,7 @@ TRAINING = {"torch", "torchvision", "ultralytics"}
 MAY_TRAIN = ("detect/training/",)
 
 SOURCES = sorted(path for part in PARTS for path in (ROOT / part).glob("**/*.py"))
-OUTSIDE = sorted(path for part in ("bench", "docs") for path in (ROOT / part).glob("*.py"))
+OUTSIDE = sorted(path for part in ("bench", "docs") for path in (ROOT / part).glob("**/*.py"))
 
 NAMES_KINDS = {
     "prim/shapes.py": "the table itself",
@@ -195,6 +195,11 @@ def test_heavy_packages_stay_where_they_belong(path: Path) -> None:
     names = imported_packages(tree_of(path))
     assert "rerun" not in names or name_of(path) in ("replay/viewer.py", "replay/viewer_layout.py")
     assert not names & TRAINING or name_of(path).startswith(MAY_TRAIN)
+
+
+def test_guided_fuzzing_alone_imports_atheris() -> None:
+    importing = [name_of(path) for path in [*SOURCES, *OUTSIDE] if "atheris" in imported_packages(tree_of(path))]
+    assert importing == ["bench/fuzz_guided.py"]
 
 
 def test_no_module_imports_itself_by_way_of_others() -> None:

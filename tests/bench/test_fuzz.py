@@ -12,18 +12,24 @@ from pathlib import Path
 import pytest
 
 from bench.fuzz import Fuzzer, Result, Stream, keep
+from bench.fuzz_guided import report
 from bench.fuzzing import mcap_file
 from bench.fuzzing.bombs import zstd_zeros
 from bench.fuzzing.case import Case
 from bench.fuzzing.damage import CHANGES
 from bench.fuzzing.judge import LISTING, RECOVER, Limits, Outcome, problem
 from bench.fuzzing.kinds import KINDS, make_case, plan
+from bench.fuzzing.messages import damaged_words
 from bench.fuzzing.samples import Samples, make_samples
+from bench.fuzzing.targets import TYPES, Target, targets, use_folder
 from bench.fuzzing.worker import Worker
+from prim.log.decoding.codecs import ENCODINGS, codec_of
 from tests.bench import fakes
 
 CASES, SEED = 260, 1
 """Of the bounded run."""
+MUTATIONS = 60
+"""Of each target of guided fuzzing."""
 PATIENT = Limits(seconds=4.0, patience=4.0)
 """Of the bounded run: a machine that has other things to do compiles slowly."""
 QUICK = Limits(seconds=0.1, megabytes=150.0, patience=0.4, wall_seconds=1.0)
@@ -187,6 +193,61 @@ def test_findings_are_kept(tmp_path: Path) -> None:
     keep(tmp_path, RESULT, Case("x", {"bag/a.db3": b"1", "bag/metadata.yaml": b"2"}))
     assert (tmp_path / "bytes-4/bag/a.db3").read_bytes() == b"1"
     assert "other content" in (tmp_path / "bytes-4/finding.txt").read_text()
+
+
+@pytest.fixture(scope="module")
+def inputs(samples: Samples) -> dict[str, list[bytes]]:
+    """What guided fuzzing begins with, and what it may make of that."""
+    use_folder(samples)
+    found = {}
+    for name, target in targets().items():
+        rng = random.Random(name)
+        seeds = list(target.seeds(samples))
+        changed = [_mutated(target, rng, rng.choice(seeds)) for _ in range(MUTATIONS)]
+        found[name] = seeds + changed
+    return found
+
+
+def _mutated(target: Target, rng: random.Random, data: bytes) -> bytes:
+    def mutate(part: bytes) -> bytes:
+        return damaged_words(rng, part)[1]
+
+    return target.mutate(rng, data, mutate) if target.mutate else data[:1] + mutate(data[1:])
+
+
+@pytest.mark.parametrize("name", targets())
+def test_targets_take_what_guided_fuzzing_gives_them(inputs: dict[str, list[bytes]], name: str) -> None:
+    for data in inputs[name]:
+        targets()[name].run(data)
+    assert len(set(inputs[name])) > MUTATIONS / 2
+
+
+def test_seeds_of_logs_and_messages_are_read(inputs: dict[str, list[bytes]], samples: Samples) -> None:
+    """Else fuzzing would search in what is refused at once."""
+    types = {kind for kind in TYPES if any(_is_decoded(kind, data) for data in inputs["codecs"])}
+    assert types >= {*samples.content.types.values(), "sensor_msgs/msg/PointCloud2", "foxglove.LaserScan"}
+
+
+def _is_decoded(kind: str, data: bytes) -> bool:
+    kinds = [k for k in TYPES for encoding in ENCODINGS if codec_of(k, encoding) is not None]
+    codecs = [c for k in TYPES for encoding in ENCODINGS if (c := codec_of(k, encoding)) is not None]
+    number = data[0] % len(codecs)
+    try:
+        return kinds[number] == kind and codecs[number].decode(data[1:]) is not None
+    except ValueError:
+        return False
+
+
+def test_unexpected_exceptions_are_reported_once(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    found: set[str] = set()
+    for number in (1, 2):
+        try:
+            json.loads("{")
+        except ValueError as error:
+            report(error, bytes([number]), "documents", tmp_path, found)
+    [line] = capsys.readouterr().out.splitlines()
+    assert line.startswith("finding: documents: JSONDecodeError at decoder.py:")
+    assert [path.read_bytes() for path in tmp_path.iterdir()] == [b"\x01"]
 
 
 def results(fuzzer: Fuzzer) -> Iterator[Result]:
