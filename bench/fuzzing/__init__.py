@@ -1,1 +1,1 @@
-"""Hostile and damaged inputs by kind, the workers that replay them, and what counts as a finding (bench.fuzz)."""
+"""Damaged and hostile inputs, made at random."""
