@@ -26,7 +26,7 @@ from bench.fuzzing.worker import Worker
 from prim.log.decoding.codecs import ENCODINGS, codec_of
 from tests.bench import fakes
 
-CASES, SEED = 260, 1
+CASES, SEED = 150, 1
 """Of the bounded run."""
 MUTATIONS = 60
 """Of each target of guided fuzzing."""
@@ -39,6 +39,12 @@ CASE = Case("nothing", {"log.mcap": b"abc"})
 @pytest.fixture(scope="module")
 def samples() -> Samples:
     return make_samples(SEED)
+
+
+@pytest.fixture(scope="module")
+def fuzzer(samples: Samples) -> Iterator[Fuzzer]:
+    with Fuzzer(samples, SEED, limits=PATIENT) as fuzzer:
+        yield fuzzer
 
 
 FINDINGS = [
@@ -112,10 +118,9 @@ def test_limits_grow_with_the_input() -> None:
     assert Case("", {"a": bytes(2_000_000), "b": bytes(1_000_000)}).megabytes == 3.0
 
 
-def test_all_samples_are_intact_logs(samples: Samples) -> None:
+def test_all_samples_are_intact_logs(samples: Samples, fuzzer: Fuzzer) -> None:
     """They are what damage is compared with: each is replayed, and those that are lossless agree."""
-    with Fuzzer(samples, SEED, limits=PATIENT) as fuzzer:
-        contents = {name: fuzzer.content(name) for name in samples.by_name}
+    contents = {name: fuzzer.content(name) for name in samples.by_name}
     assert all(contents.values())
     assert contents["mcap"] & contents["mcap-small-chunks"] & contents["mcap-no-crc"]
 
@@ -250,13 +255,8 @@ def test_unexpected_exceptions_are_reported_once(tmp_path: Path, capsys: pytest.
     assert [path.read_bytes() for path in tmp_path.iterdir()] == [b"\x01"]
 
 
-def results(fuzzer: Fuzzer) -> Iterator[Result]:
-    return (result for result, _ in fuzzer.run(plan(KINDS, CASES)))
-
-
-def test_no_hostile_input_does_harm(samples: Samples) -> None:
+def test_no_hostile_input_does_harm(fuzzer: Fuzzer) -> None:
     """A bounded form of bench.fuzz: some of every kind, with a seed of its own."""
-    with Fuzzer(samples, SEED, limits=PATIENT) as fuzzer:
-        found = list(results(fuzzer))
+    found = [result for result, _ in fuzzer.run(plan(KINDS, CASES))]
     assert [line for result in found for line in result.lines(SEED)] == []
     assert {code for result in found for code in result.codes} >= {"0", "1", "3"}
