@@ -1,176 +1,318 @@
-"""Robustness to damaged logs: no damage may cause a crash, a hang, or wrong content that is passed off as intact.
+"""Robustness to damaged and hostile inputs: none may do harm, and no result may be wrong in silence.
 
-    python -m bench.fuzz [--cuts 200] [--bytes 2000] [--seed 0]
+    python -m bench.fuzz [--cases 10000] [--kinds a,b] [--seed 0] [--jobs N] [--keep FOLDER] [--results FILE] [--anew]
+    python -m bench.fuzz --case KIND:NUMBER [--seed 0] [--keep FOLDER]
 
-A cut leaves the first N bytes of the log; a flip changes one byte, half of them within likely length fields. Each
-damaged log is replayed twice: plainly, and with --recover. Failures are: a traceback or a signal, an error of more
-than one line, a replay of more than 20 s, an exit code other than 0, 1 and 3, or exit code 0 with a map, poses or
-counts that differ from the intact log's. Exits with 1 where any replay failed.
+The kinds are those of bench.fuzzing.kinds. Each log is replayed plainly and with --recover, and listed where its kind
+says so. A finding is what bench.fuzzing.judge says: a traceback, no end, memory beyond the limit, an exit code other
+than 0, 1 and 3, exit code 0 with other content than the whole log's, more than one error line, a raw control
+character, a report that is no JSON. Each is printed as one line with the command that repeats it; --keep keeps its
+files. Results stream into a file, by default in the system's temporary folder: a run that was cut off goes on there,
+unless --anew. Exits with 1 where there is any finding.
 """
 
 from __future__ import annotations
 
 import argparse
-import contextlib
-import io
 import json
-import random
-import re
 import sys
 import tempfile
 import time
 from collections import Counter
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import ExitStack
+from dataclasses import dataclass, replace
 from pathlib import Path
+from queue import SimpleQueue
+from typing import Any
 
-from prim import console
-from recorder.sensors import Lidar
-from recorder.session import SessionOptions, record_session
-from replay.cli import app
+from bench.fuzzing.case import Case
+from bench.fuzzing.judge import LIMITS, LISTING, RECOVER, Limits, Outcome, problem
+from bench.fuzzing.kinds import KINDS, make_case, plan
+from bench.fuzzing.samples import Samples, make_samples
+from bench.fuzzing.worker import Command, Worker, replay_command
+from prim.text import printable
 
-MAX_SECONDS = 20.0
+FAST = ("--mapper", "det", "--no-viewer", "--no-detect")
+"""Options of cases that have none of their own."""
 
-LENGTH_FIELD = re.compile(rb"[\x00-\xff]{2}\x00\x00")
-"""A small little-endian number of 32 bits."""
+WARM_UP = (
+    "mcap", "mcap-lz4", "mcap-unindexed", "bag-bz2", "bag-lz4", "db3.zstd", "foxglove-json", "foxglove-protobuf",
+    "carmen-flaser-gz", "mcap-split", "part",
+)  # fmt: skip
+"""Samples that a worker replays before any case."""
+
+WARM_OPTIONS = tuple(
+    tuple(words.split())
+    for words in (
+        "--no-detect --mapper prob",
+        "--no-detect --mapper forward",
+        "--no-detect --pose fused --match-scans",
+        "--no-detect --pose tf",
+        "--pose odom",
+    )
+)
+"""Options with which a worker replays a sample before any case."""
+
+QUOTED = 240
+"""So much of an error a finding quotes (characters)."""
 
 
 @dataclass(frozen=True)
-class Outcome:
-    """The outcome of a replay.
+class Result:
+    """What became of a case.
 
     Attributes:
-        code: The exit code.
-        error: What was printed to stderr.
-        content: The map's bytes, the poses, and counts, poses and map of the report.
-        seconds: The run time (s).
+        kind: Its kind.
+        number: Which one of that kind.
+        what: What was done.
+        codes: How each run ended: an exit code, or a word.
+        findings: What was wrong.
     """
 
-    code: int
-    error: str
-    content: tuple[bytes, bytes, str]
-    seconds: float
+    kind: str
+    number: int
+    what: str
+    codes: tuple[str, ...]
+    findings: tuple[str, ...]
+
+    def lines(self, seed: int) -> Iterator[str]:
+        """Yield a line for each finding, with the command that repeats it."""
+        for finding in self.findings:
+            command = f"python -m bench.fuzz --seed {seed} --case {self.kind}:{self.number}"
+            yield printable(f"{self.kind}:{self.number} {finding} [{self.what[:QUOTED]}] {command}")
 
 
-def replay(log: Path, folder: Path, *options: str) -> Outcome:
-    """Replay a log in this process: a signal that kills it fails the whole run, as it should.
+class Fuzzer:
+    """Runs cases in worker processes.
 
     Args:
-        log: The log.
-        folder: Where the outputs go.
-        options: Further options of prim-replay.
-
-    Returns:
-        The outcome.
+        samples: The intact logs.
+        seed: Of all cases.
+        jobs: How many workers.
+        command: What is fuzzed.
+        limits: What a run may take.
     """
-    outputs = {name: folder / name for name in ("m.pgm", "m.yaml", "t.tum", "r.json")}
-    for path in outputs.values():
-        path.unlink(missing_ok=True)
-    files = ["--map", str(folder / "m"), "--trajectory", str(outputs["t.tum"]), "--report", str(outputs["r.json"])]
-    began = time.perf_counter()
-    with contextlib.redirect_stderr(io.StringIO()) as error, contextlib.redirect_stdout(io.StringIO()):
-        code = console.run(app, "prim-replay", [str(log), "--mapper", "det", "--no-viewer", *files, *options])
-    seconds = time.perf_counter() - began
-    content = b"", b"", ""
-    if code in (0, 3):
-        report = json.loads(outputs["r.json"].read_text())
-        counts = {key: value for key, value in report["log"].items() if key != "path"}
-        content = (
-            outputs["m.pgm"].read_bytes(),
-            outputs["t.tum"].read_bytes(),
-            json.dumps([counts, report["pose"], report["map"]]),
-        )
-    return Outcome(code, error.getvalue(), content, seconds)
+
+    def __init__(
+        self,
+        samples: Samples,
+        seed: int = 0,
+        jobs: int = 1,
+        command: Command = replay_command,
+        limits: Limits = LIMITS,
+    ) -> None:
+        self._samples, self._seed, self._jobs, self._limits = samples, seed, jobs, limits
+        self._stack = ExitStack()
+        warm_up = [_intact(samples, name) for name in WARM_UP]
+        warm_up += [replace(_intact(samples, "mcap"), options=("--no-viewer", *options)) for options in WARM_OPTIONS]
+        self._workers: SimpleQueue[Worker] = SimpleQueue()
+        for _ in range(jobs):
+            self._workers.put(self._stack.enter_context(Worker(command, warm_up, limits)))
+        self._contents: dict[str, set[str]] = {}
+
+    def __enter__(self) -> Fuzzer:
+        return self
+
+    def __exit__(self, *exception: object) -> None:
+        self._stack.close()
+
+    def run(self, cases: Sequence[tuple[str, int]]) -> Iterator[tuple[Result, Case]]:
+        """Run cases.
+
+        Args:
+            cases: Their kinds and numbers.
+
+        Yields:
+            What became of each, in the order in which they end, and the case.
+        """
+        with ThreadPoolExecutor(self._jobs) as pool:
+            yield from pool.map(lambda case: self.run_one(*case), cases)
+
+    def run_one(self, kind: str, number: int) -> tuple[Result, Case]:
+        """Run one case.
+
+        Args:
+            kind: Its kind.
+            number: Which one of that kind.
+
+        Returns:
+            What became of it, and the case.
+        """
+        case = make_case(kind, number, self._seed, self._samples)
+        case = case if case.options else replace(case, options=FAST)
+        worker = self._workers.get()
+        try:
+            whole = self._content_of(worker, case.sample)
+            runs = [(), (RECOVER,), *([(LISTING, "--json")] if KINDS[kind].lists else [])]
+            outcomes = [worker.run(case, options) for options in runs]
+        finally:
+            self._workers.put(worker)
+        findings = [
+            _finding(outcome, found) for outcome in outcomes if (found := self._problem(case, outcome, whole))
+        ]
+        codes = tuple(outcome.ending.split(":")[0] or str(outcome.code) for outcome in outcomes)
+        return Result(kind, number, case.what, codes, tuple(findings)), case
+
+    def _problem(self, case: Case, outcome: Outcome, whole: set[str]) -> str:
+        return problem(case, outcome, whole, self._limits)
+
+    def content(self, name: str) -> set[str]:
+        """Return the contents of a sample, read plainly and to recover it. Raises RuntimeError where it has none."""
+        worker = self._workers.get()
+        try:
+            return self._content_of(worker, name)
+        finally:
+            self._workers.put(worker)
+
+    def _content_of(self, worker: Worker, name: str) -> set[str]:
+        """See :meth:`content`; of no sample, nothing."""
+        if name and name not in self._contents:
+            outcomes = [worker.run(_intact(self._samples, name), options) for options in ((), (RECOVER,))]
+            self._contents[name] = {outcome.content for outcome in outcomes if outcome.content}
+            if not self._contents[name]:
+                raise RuntimeError(f"the intact log {name} cannot be replayed: {outcomes}")
+        return self._contents.get(name, set())
 
 
-def problem(outcome: Outcome, whole: Outcome) -> str | None:
-    """Return how a replay failed.
+def _intact(samples: Samples, name: str) -> Case:
+    return Case(f"{name}, intact", samples.by_name[name].files, name, FAST)
+
+
+def _finding(outcome: Outcome, found: str) -> str:
+    """Return a finding with the options that lead to it, and what was printed."""
+    errors = " ".join(outcome.errors.split())[:QUOTED]
+    return f"{' '.join(outcome.options) or 'plainly'}: {found}" + (f": {errors}" if errors else "")
+
+
+class Stream:
+    """The file of results of a run: a line for each case, so that a run that was cut off can go on.
 
     Args:
-        outcome: Its outcome.
-        whole: The outcome of the intact log.
-
-    Returns:
-        The failure; None where there is none.
+        path: The file.
+        run: What the run is: the results of another one are of no use to it.
+        anew: Begin again.
     """
-    errors = [line for line in outcome.error.splitlines() if not line.startswith("note: ")]
-    if "Traceback" in outcome.error or "this is a bug" in outcome.error:
-        return "an unexpected exception"
-    if outcome.code not in (0, 1, 3):
-        return f"exit code {outcome.code}"
-    if len(errors) != (outcome.code == 1):
-        return f"{len(errors)} error lines with exit code {outcome.code}"
-    if outcome.seconds > MAX_SECONDS:
-        return f"it took {outcome.seconds:.0f} s"
-    if outcome.code == 0 and outcome.content != whole.content:
-        return "exit code 0 with other content"
-    return None
+
+    def __init__(self, path: Path, run: dict[str, Any], anew: bool = False) -> None:
+        self.path = path
+        self.results: list[Result] = []
+        lines = path.read_text(encoding="utf-8").splitlines() if path.exists() and not anew else []
+        read = [value for line in lines if (value := _parsed(line)) is not None]
+        if read and read[0] == run and not read[-1].get("done"):
+            self.results = [
+                Result(r["kind"], r["number"], r["what"], tuple(r["codes"]), tuple(r["findings"])) for r in read[1:]
+            ]
+        path.write_text("", encoding="utf-8")
+        self._write(run)
+        for result in self.results:
+            self._write(vars(result))
+
+    def add(self, result: Result) -> None:
+        """Write a result."""
+        self.results.append(result)
+        self._write(vars(result))
+
+    def complete(self) -> None:
+        """Note that the run is complete: the next one begins anew."""
+        self._write({"done": True})
+
+    def _write(self, value: dict[str, Any]) -> None:
+        with self.path.open("a", encoding="utf-8") as stream:
+            stream.write(json.dumps(value) + "\n")
 
 
-def damaged(data: bytes, cuts: int, flips: int, rng: random.Random) -> list[tuple[str, bytes]]:
-    """Damage a log in many ways.
+def _parsed(line: str) -> Any:
+    """Return the value of a line; None of the last one, where it was cut off."""
+    try:
+        return json.loads(line)
+    except ValueError:
+        return None
+
+
+def keep(folder: Path, result: Result, case: Case) -> None:
+    """Keep the files of a case, and what it found.
 
     Args:
-        data: The log.
-        cuts: Number of cuts.
-        flips: Number of flips.
-        rng: The source of randomness.
-
-    Returns:
-        Pairs of what was done and the damaged log.
+        folder: Where.
+        result: What became of it.
+        case: The case.
     """
-    logs = [(f"cut at {at}", data[:at]) for at in sorted(rng.sample(range(len(data)), min(cuts, len(data))))]
-    lengths = [match.start() for match in LENGTH_FIELD.finditer(data)]
-    for index in range(flips):
-        at = rng.choice(lengths) + rng.randrange(4) if index % 2 else rng.randrange(len(data))
-        change = rng.randrange(1, 256)
-        logs.append((f"byte {at} ^ {change:#04x}", data[:at] + bytes([data[at] ^ change]) + data[at + 1 :]))
-    return logs
+    place = folder / f"{result.kind}-{result.number}"
+    for name, data in case.files.items():
+        (place / name).parent.mkdir(parents=True, exist_ok=True)
+        (place / name).write_bytes(data)
+    lines = [case.what, *result.findings, f"options: {' '.join(case.options)}"]
+    (place / "finding.txt").write_text("\n".join(map(printable, lines)) + "\n", encoding="utf-8")
 
 
-def fuzz(folder: Path, cuts: int, flips: int, seed: int) -> tuple[Counter[str], list[str]]:
-    """Record a log, damage it in many ways, and replay each.
-
-    Args:
-        folder: Where all files go.
-        cuts: Number of cuts.
-        flips: Number of flips.
-        seed: Seed of the session and of the damage.
-
-    Returns:
-        How often each exit code occurred, and the failures.
-    """
-    rng = random.Random(seed)
-    log = folder / "whole.mcap"
-    record_session(log, SessionOptions(seed=seed, stops=(5, 5), lidar=Lidar(rays=24)))
-    whole = replay(log, folder)
-    assert whole.code == 0, whole.error
-    codes: Counter[str] = Counter()
-    failures = []
-    bad = folder / "bad.mcap"
-    for what, data in damaged(log.read_bytes(), cuts, flips, rng):
-        bad.write_bytes(data)
-        for options in ((), ("--recover",)):
-            outcome = replay(bad, folder, *options)
-            codes[f"exit {outcome.code}{' recovering' if options else ''}"] += 1
-            failure = problem(outcome, whole)
-            if failure:
-                failures.append(f"{what}{' --recover' if options else ''}: {failure}: {outcome.error.strip()[:300]}")
-    return codes, failures
+def summary(results: Sequence[Result]) -> Iterator[str]:
+    """Yield a line for each kind: how many cases, how their runs ended, and how many have findings."""
+    for kind in dict.fromkeys(result.kind for result in results):
+        own = [result for result in results if result.kind == kind]
+        codes = Counter(code for result in own for code in result.codes)
+        listed = ", ".join(f"{name}: {count}" for name, count in sorted(codes.items()))
+        yield f"{kind}: {len(own)} cases, {sum(bool(r.findings) for r in own)} with findings; exit codes {listed}"
 
 
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    parser.add_argument("--cuts", type=int, default=200)
-    parser.add_argument("--bytes", type=int, default=2000)
+    parser.add_argument("--cases", type=int, default=10_000)
+    parser.add_argument("--kinds", default=",".join(KINDS), help=f"some of {','.join(KINDS)}")
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--jobs", type=int, default=1)
+    parser.add_argument("--keep", type=Path)
+    parser.add_argument("--case", help="run this one alone: KIND:NUMBER")
+    parser.add_argument("--results", type=Path)
+    parser.add_argument("--anew", action="store_true")
     options = parser.parse_args()
-    with tempfile.TemporaryDirectory() as folder:
-        codes, failures = fuzz(Path(folder), options.cuts, options.bytes, options.seed)
-    print(", ".join(f"{name}: {count}" for name, count in sorted(codes.items())))
-    for line in failures:
+    unknown = [kind for kind in options.kinds.split(",") if kind not in KINDS]
+    if unknown:
+        parser.error(f"no kind {unknown[0]}: there are {', '.join(KINDS)}")
+    samples = make_samples(options.seed)
+    with Fuzzer(samples, options.seed, options.jobs) as fuzzer:
+        return _run_one(fuzzer, options) if options.case else _run_all(fuzzer, options)
+
+
+def _run_one(fuzzer: Fuzzer, options: argparse.Namespace) -> int:
+    kind, number = options.case.split(":")
+    result, case = fuzzer.run_one(kind, int(number))
+    print(
+        printable(
+            f"{options.case}: {result.what}; options {' '.join(case.options)}; exit codes {', '.join(result.codes)}"
+        )
+    )
+    for line in result.lines(options.seed):
         print(line)
-    print(f"{len(failures)} of {codes.total()} replays failed")
-    return 1 if failures else 0
+    if options.keep:
+        keep(options.keep, result, case)
+    return 1 if result.findings else 0
+
+
+def _run_all(fuzzer: Fuzzer, options: argparse.Namespace) -> int:
+    path = options.results or Path(tempfile.gettempdir()) / f"prim-fuzz-{options.seed}.jsonl"
+    run = {"seed": options.seed, "cases": options.cases, "kinds": options.kinds}
+    stream = Stream(path, run, options.anew)
+    for earlier in stream.results:
+        for line in earlier.lines(options.seed):
+            print(line)
+    done = {(result.kind, result.number) for result in stream.results}
+    cases = [case for case in plan(options.kinds.split(","), options.cases) if case not in done]
+    began = time.monotonic()
+    for result, case in fuzzer.run(cases):
+        stream.add(result)
+        for line in result.lines(options.seed):
+            print(line, flush=True)
+        if result.findings and options.keep:
+            keep(options.keep, result, case)
+    stream.complete()
+    print("\n".join(summary(stream.results)))
+    found = sum(bool(result.findings) for result in stream.results)
+    print(
+        f"{found} of {len(stream.results)} cases have findings ({time.monotonic() - began:.0f} s; results in {path})"
+    )
+    return 1 if found else 0
 
 
 if __name__ == "__main__":

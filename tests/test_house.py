@@ -75,7 +75,10 @@ TRAINING = {"torch", "torchvision", "ultralytics"}
 MAY_TRAIN = ("detect/training/",)
 
 SOURCES = sorted(path for part in PARTS for path in (ROOT / part).glob("**/*.py"))
-OUTSIDE = sorted(path for part in ("bench", "docs") for path in (ROOT / part).glob("*.py"))
+OUTSIDE = sorted(path for part in ("bench", "docs") for path in (ROOT / part).glob("**/*.py"))
+
+OF_TUPLES = ("_replace", "_make", "_asdict", "_fields")
+"""The public names of named tuples that begin with an underscore."""
 
 NAMES_KINDS = {
     "prim/shapes.py": "the table itself",
@@ -199,6 +202,11 @@ def test_heavy_packages_stay_where_they_belong(path: Path) -> None:
     assert not names & TRAINING or name_of(path).startswith(MAY_TRAIN)
 
 
+def test_guided_fuzzing_alone_imports_atheris() -> None:
+    importing = [name_of(path) for path in [*SOURCES, *OUTSIDE] if "atheris" in imported_packages(tree_of(path))]
+    assert importing == ["bench/fuzz_guided.py"]
+
+
 def test_no_module_imports_itself_by_way_of_others() -> None:
     """All but the public face, which names what stands above it, and loads it when it is used."""
     below = {module: path for module, path in MODULES.items() if module != "prim"}
@@ -286,7 +294,8 @@ def test_kinds_are_known_by_their_rows(path: Path) -> None:
 @pytest.mark.parametrize("path", OUTSIDE, ids=name_of)
 def test_benches_and_docs_use_public_names_only(path: Path) -> None:
     for node in ast.walk(tree_of(path)):
-        if isinstance(node, ast.Attribute) and node.attr.startswith("_") and not node.attr.startswith("__"):
+        is_private = isinstance(node, ast.Attribute) and node.attr.startswith("_") and node.attr not in OF_TUPLES
+        if isinstance(node, ast.Attribute) and is_private and not node.attr.startswith("__"):
             assert ast.unparse(node.value) in ("self", "cls"), ast.unparse(node)
         if isinstance(node, ast.ImportFrom):
             assert not [alias.name for alias in node.names if alias.name.startswith("_")]

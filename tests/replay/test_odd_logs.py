@@ -209,15 +209,6 @@ def test_other_encodings_are_named(replay: Replay, encoding: str) -> None:
     assert (code, repr(encoding) in err, err.count("\n")) == (1, True, 1)
 
 
-def test_damaged_logs_are_never_taken_for_intact(tmp_path: Path) -> None:
-    """A bounded form of bench.fuzz, with other seeds each in their own way: cuts and flipped bytes."""
-    from bench.fuzz import fuzz
-
-    codes, wrong = fuzz(tmp_path, cuts=15, flips=60, seed=1)
-    assert wrong == []
-    assert codes["exit 0"] > 0 and codes["exit 1"] > 0 and codes["exit 3 recovering"] > 0
-
-
 def write_chunks(path: Path, *chunks: tuple[int, ...], uncounted: int = 0) -> Path:
     """A log of scans at these seconds, chunk by chunk, whose summary counts more than there are."""
     with path.open("wb") as stream:
