@@ -1,0 +1,54 @@
+"""What a network may take: a file from anywhere is checked against these bounds before it is run."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+
+class GraphError(ValueError):
+    """A network that is damaged, or that is not run; the message says what is wrong with it."""
+
+
+@dataclass(frozen=True)
+class NetworkLimits:
+    """Bounds of a network's file, of its graph, and of one run of it. All are set by hand.
+
+    The shipped YOLO's batch of eight tiles of 224 x 224 cells takes 2.3e9 multiply-adds and 36e6 numbers; a YOLOv5s'
+    image of 640 x 640 pixels takes 8.2e9 and 73e6.
+    """
+
+    max_file_bytes: int = 64 << 20
+    """Largest file (bytes)."""
+
+    max_card_bytes: int = 1 << 20
+    """Largest model card (bytes of its JSON)."""
+
+    max_fields: int = 200_000
+    """Largest number of fields in the file, and of numbers that it does not hold as plain arrays."""
+
+    max_nodes: int = 4096
+    """Largest number of nodes of the graph."""
+
+    max_rank: int = 8
+    """Largest number of a tensor's dimensions."""
+
+    max_elements: int = 16 << 20
+    """Largest number of elements of a tensor."""
+
+    max_constant_bytes: int = 160 << 20
+    """Largest sum (bytes) of all tensors that depend on constants alone: they are kept while the network is loaded."""
+
+    max_activation_bytes: int = 1 << 30
+    """Largest sum (bytes) of all other tensors of a run."""
+
+    max_live_bytes: int = 192 << 20
+    """Largest sum (bytes) of those of a run that are needed at a time."""
+
+    max_multiply_adds: float = 64e9
+    """Largest number of multiply-adds of a run, or of as much other work."""
+
+    max_known: int = 4096
+    """Tensors of at most this many elements are computed where they depend on sizes and constants alone."""
+
+
+DEFAULTS = NetworkLimits()
