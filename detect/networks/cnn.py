@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from detect.networks.parameters import PRESETS, Preset, crop_box, decode_parameters
 from detect.networks.tiles import Box
-from detect.networks.weights import Weights, WeightsError
+from detect.networks.weights import BATCHES, Weights, WeightsError
 from mapping.grid import GridFrame
 from prim.shapes import Kind, Primitive
 
@@ -74,21 +74,19 @@ class _Network:
 
     def __init__(self, weights: Weights) -> None:
         self.weights = weights
-        if weights.card.preset not in PRESETS:
-            raise WeightsError(f"{weights.path} has a card with an unknown preset {weights.card.preset!r}")
-        self.preset: Preset = PRESETS[weights.card.preset]
+        self.preset: Preset = PRESETS[str(weights.card.preset)]
         self.kinds = [Kind(kind) for kind in weights.card.kinds]
-        self._input = weights.session.get_inputs()[0].name
-        outputs = self.run(np.zeros((1, self.preset.pixels, self.preset.pixels), np.uint8)).shape[-1]
-        expected = sum(self.preset.output_count(kind) for kind in self.kinds)
-        if outputs != expected:
-            raise WeightsError(f"{weights.path} gives {outputs} numbers where its card says {expected}")
+        self.run(np.zeros((1, self.preset.pixels, self.preset.pixels), np.uint8))
 
     def run(self, crops: NDArray[np.uint8]) -> NDArray[np.float32]:
         """Return outputs (N, M) of crops (N, pixels, pixels)."""
-        scaled = crops.astype(np.float32)[:, None] / np.float32(255)
-        images = np.repeat(scaled, self.weights.card.channels, axis=1)
-        try:
-            return np.asarray(self.weights.session.run(None, {self._input: images})[0], dtype=np.float32)
-        except Exception as error:  # ONNX Runtime raises undocumented exceptions of many types
-            raise WeightsError(f"{self.weights.path} does not take crops as its card says") from error
+        found = []
+        for first in range(0, len(crops), BATCHES["cnn"]):
+            scaled = crops[first : first + BATCHES["cnn"]].astype(np.float32)[:, None] / np.float32(255)
+            found.append(self.weights.run(np.repeat(scaled, self.weights.card.channels, axis=1)))
+        outputs = np.concatenate(found)
+        expected = len(crops), sum(self.preset.output_count(kind) for kind in self.kinds)
+        if outputs.shape != expected:
+            shape, wanted = (" x ".join(map(str, sizes)) for sizes in (outputs.shape, expected))
+            raise WeightsError(f"{self.weights.path} gives {shape} numbers where its card says {wanted}")
+        return outputs

@@ -36,7 +36,7 @@ class NetworkLimits:
     """Largest number of elements of a tensor."""
 
     max_constant_bytes: int = 160 << 20
-    """Largest sum (bytes) of all tensors that depend on constants alone: they are kept while the network is loaded."""
+    """Largest sum (bytes) of all tensors that depend on constants alone, which are kept."""
 
     max_activation_bytes: int = 1 << 30
     """Largest sum (bytes) of all other tensors of a run."""

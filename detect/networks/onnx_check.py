@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -45,14 +45,34 @@ def check_network(network: Network, input_shape: Shape, limits: NetworkLimits = 
         The costs, which are within the bounds.
 
     Raises:
-        GraphError: The network has operators that are not run, does not take such an input, has shapes that do not fit
-            together or depend on what an image shows, or exceeds a bound.
+        GraphError: The network has operators that are not run, does not take such an input, has shapes that do not
+            fit together or depend on what an image shows, or exceeds a bound.
     """
     if not MIN_OPSET <= network.opset <= MAX_OPSET:
         raise GraphError(f"it has operators of version {network.opset}, not of {MIN_OPSET} to {MAX_OPSET}")
     if len(network.nodes) > limits.max_nodes:
         raise GraphError(f"it has {len(network.nodes)} nodes, more than {limits.max_nodes}")
     return _Inference(network, limits).run(input_shape)
+
+
+class NetworkCheck:
+    """The checks of one network, done once for each shape of its input.
+
+    Args:
+        network: The network.
+        limits: The bounds.
+    """
+
+    def __init__(self, network: Network, limits: NetworkLimits = DEFAULTS) -> None:
+        constants = {name: _sizes_of(array, limits.max_known) for name, array in network.constants.items()}
+        self._network, self._limits = replace(network, constants=constants), limits
+        self._costs: dict[Shape, Costs] = {}
+
+    def __call__(self, input_shape: Shape) -> Costs:
+        """See :func:`check_network`."""
+        if input_shape not in self._costs:
+            self._costs[input_shape] = check_network(self._network, input_shape, self._limits)
+        return self._costs[input_shape]
 
 
 class _Inference:
@@ -120,6 +140,11 @@ class _Inference:
 def _check(what: str, size: float, limit: float) -> None:
     if size > limit:
         raise GraphError(f"it takes {what}: {size:.3g}, more than {limit:.3g}")
+
+
+def _sizes_of(array: Array, max_known: int) -> Array:
+    """Return a copy of a small array, and zeros that take no memory in place of a large one."""
+    return array.copy() if array.size <= max_known else np.broadcast_to(array.dtype.type(0), array.shape)
 
 
 def _constant(array: Array, max_known: int) -> Value:

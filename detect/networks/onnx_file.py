@@ -1,7 +1,7 @@
 """ONNX files: the part of the format that detectors need, read within bounds, and written anew.
 
 ONNX Runtime would parse all of a file, with functions, subgraphs, sparse and external arrays, whatever it takes. Here
-the fields of onnx.proto (protobuf's wire format) that a detector has are read, all others are left out or refused, and
+the fields of onnx.proto (protobuf's wire format) that a detector has are read, others are left out or refused, and
 ONNX Runtime is given the network as it is written anew: nothing that has not been checked.
 """
 
@@ -11,6 +11,7 @@ import math
 import struct
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,7 +19,8 @@ from numpy.typing import NDArray
 from detect.networks.limits import DEFAULTS, GraphError, NetworkLimits
 from prim.strict_json import shown
 
-Array = NDArray[np.generic]
+Array = NDArray[Any]
+DType = np.dtype[Any]
 
 Attribute = int | float | bytes | tuple[int, ...] | tuple[float, ...] | Array
 """An attribute of a node: a number, a text, numbers or an array."""
@@ -75,7 +77,7 @@ class Port:
     """
 
     name: str
-    dtype: np.dtype[np.generic]
+    dtype: DType
     shape: tuple[int | str, ...] | None
 
 
@@ -121,7 +123,7 @@ def read_network(content: bytes, limits: NetworkLimits = DEFAULTS) -> Network:
     model = _Message(memoryview(content), _Budget(limits.max_fields))
     if model.has(25):
         raise GraphError("it has functions of its own")
-    graph = model.message(7)
+    opset, graph = _opset(model), model.message(7)
     if graph.has(15):
         raise GraphError("it has sparse arrays")
     constants = dict(_named_array(message) for message in graph.messages(5))
@@ -131,7 +133,7 @@ def read_network(content: bytes, limits: NetworkLimits = DEFAULTS) -> Network:
         raise GraphError(f"it has {len(inputs)} inputs and {len(outputs)} outputs, not one of each")
     return Network(
         ir_version=model.integer(1),
-        opset=_opset(model),
+        opset=opset,
         nodes=tuple(map(_node, graph.messages(1))),
         constants=constants,
         input=inputs[0],
@@ -153,7 +155,7 @@ class _Budget:
 
 
 class _Message:
-    """A message: its fields by number, as they are on the wire. Of a field that is not repeated the last one counts."""
+    """A message: its fields by number, as they are on the wire; of one that is not repeated the last one counts."""
 
     def __init__(self, data: memoryview, budget: _Budget) -> None:
         self._budget = budget
@@ -229,9 +231,9 @@ def _fields(data: memoryview) -> Iterator[tuple[int, int | memoryview]]:
         elif wire in (FIXED32, FIXED64):
             size = 4 if wire == FIXED32 else 8
         else:
-            raise GraphError("it is no ONNX file, or a damaged one")
+            raise GraphError("it is no ONNX network, or a damaged one")
         if size > len(data) - at:
-            raise GraphError("it is no ONNX file, or it is cut off")
+            raise GraphError("it is no ONNX network, or it is cut off")
         yield number, data[at : at + size]
         at += size
 
@@ -246,7 +248,7 @@ def _varint(data: memoryview, at: int) -> tuple[int, int]:
         shift += 7
         if byte < 128:
             return value & (1 << 64) - 1, at
-    raise GraphError("it is no ONNX file, or it is cut off")
+    raise GraphError("it is no ONNX network, or it is cut off")
 
 
 def _signed(value: int) -> int:
@@ -257,7 +259,7 @@ def _opset(model: _Message) -> int:
     """Return the version of ONNX's own operators; other sets may be named, but none of their operators is taken."""
     versions = [message.integer(2) for message in model.messages(8) if message.text(1) in ("", "ai.onnx")]
     if len(versions) != 1:
-        raise GraphError("it is no ONNX file, or does not say of which version its operators are")
+        raise GraphError("it is no ONNX network, or does not say of which version its operators are")
     return versions[0]
 
 
@@ -270,7 +272,7 @@ def _port(message: _Message) -> Port:
     return Port(message.text(1), dtype, shape)
 
 
-def _dtype(number: int) -> np.dtype[np.generic]:
+def _dtype(number: int) -> DType:
     if number not in DTYPES:
         raise GraphError(f"it has elements of type {number} of ONNX, which detectors have no use for")
     return DTYPES[number]
@@ -297,7 +299,7 @@ def _attribute(operator: str, message: _Message) -> tuple[str, Attribute]:
     if kind == STRING:
         return name, bytes((message.pieces(4) or [memoryview(b"")])[-1])
     if kind == TENSOR:
-        return name, _named_array(message.message(5))[1]
+        return name, _named_array(message.message(5))[1].copy()
     if kind == FLOATS:
         return name, tuple(message.floats(7).tolist())
     if kind == INTS:
@@ -316,7 +318,7 @@ def _named_array(message: _Message) -> tuple[str, Array]:
     return name, values.reshape(shape)
 
 
-def _elements(message: _Message, dtype: np.dtype[np.generic]) -> Array:
+def _elements(message: _Message, dtype: DType) -> Array:
     """Return an array's elements, which are in one of several fields."""
     if message.has(9):
         raw = message.pieces(9)[-1]

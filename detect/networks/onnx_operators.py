@@ -14,7 +14,7 @@ from functools import reduce
 import numpy as np
 
 from detect.networks.limits import GraphError
-from detect.networks.onnx_file import DTYPES, Array, Attribute
+from detect.networks.onnx_file import DTYPES, Array, Attribute, DType
 from prim.strict_json import shown
 
 Shape = tuple[int, ...]
@@ -70,7 +70,7 @@ class Value:
     """
 
     shape: Shape
-    dtype: np.dtype[np.generic]
+    dtype: DType
     data: Array | None = None
     is_constant: bool = False
 
@@ -336,7 +336,7 @@ def _clip(call: Call) -> Outcome:
     return Outcome((Value(first.shape, first.dtype),))
 
 
-def _broadcasting(dtype: np.dtype[np.generic] | None = None) -> Infer:
+def _broadcasting(dtype: DType | None = None) -> Infer:
     def infer_broadcast(call: Call) -> Outcome:
         values = [call.value(i) for i in range(len(call.inputs))]
         chosen = values[1].dtype if call.operator == "Where" else values[0].dtype
@@ -691,6 +691,10 @@ def _reshaped(call: Call, arrays: Sequence[Array]) -> Array:
     return arrays[0].reshape(OPERATORS[call.operator].infer(call).values[0].shape)
 
 
+def _expanded(call: Call, arrays: Sequence[Array]) -> Array:
+    return np.broadcast_to(arrays[0], _expand(call).values[0].shape)
+
+
 def _filled(call: Call, arrays: Sequence[Array]) -> Array:
     fill = call.attributes.get("value", np.zeros(1, np.float32))
     return np.full(call.known_integers(0), np.asarray(fill).ravel()[0])
@@ -793,7 +797,7 @@ OPERATORS: Mapping[str, Operator] = {
     "Split": _of(_split, (1, 2), "axis split num_outputs", max_outputs=MANY),
     "Slice": _of(_slice, (3, 5), compute=lambda call, arrays: arrays[0][_slices(call)]),
     "Gather": _of(_gather, (2, 2), "axis", _taken),
-    "Expand": _of(_expand, (2, 2), compute=lambda call, arrays: np.broadcast_to(arrays[0], _expand(call).values[0].shape)),
+    "Expand": _of(_expand, (2, 2), compute=_expanded),
     "Tile": _of(_tile, (2, 2)),
     "Pad": _of(_pad, (2, 3), "mode"),
     "Resize": _of(
