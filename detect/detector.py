@@ -159,18 +159,23 @@ class Detector:
         )
         suppressor = self._suppress(boxes, whole & (boxes.score >= thresholds), [len(part.boxes) for part in parts])
         kept = np.flatnonzero(suppressor == np.arange(len(boxes)))
-        measured = _best_first(self._estimate(kept, boxes, part_of, frame))
-        found, overlapping = _reject_overlapping(measured, self.options.max_overlap)
+        estimated = self._estimate(kept, boxes, part_of, frame)
+        found, overlapping = _reject_overlapping(_best_first(estimated.values()), self.options.max_overlap)
         rejections = {
             i: _rejection(boxes, i, frame, self._reason(boxes, i, better, bool(whole[i])))
             for i, better in enumerate(suppressor.tolist())
             if better != i
         }
+        for i in kept.tolist():
+            if i not in estimated:
+                rejections[i] = _rejection(boxes, i, frame, "its parameters are those of no primitive in its tile")
         chosen = self._doubtful(boxes, whole & (suppressor < 0), kept)
-        doubtful = zip(
-            self._estimate(chosen, boxes, part_of, frame), [rejections[i] for i in chosen.tolist()], strict=True
+        doubtful = self._estimate(chosen, boxes, part_of, frame)
+        return Detections(
+            found,
+            _best_first([*overlapping, *rejections.values()]),
+            tuple((detection, rejections[i]) for i, detection in doubtful.items()),
         )
-        return Detections(found, _best_first([*overlapping, *rejections.values()]), tuple(doubtful))
 
     def _candidates(self, images: Iterable[tuple[GridFrame, NDArray[np.uint8]]]) -> Iterator[_TileCandidates]:
         """Run YOLO on tiles; yield those with candidates."""
@@ -209,13 +214,16 @@ class Detector:
 
     def _estimate(
         self, chosen: NDArray[np.intp], boxes: Boxes, part_of: Sequence[_TileCandidates], frame: GridFrame
-    ) -> list[Detection]:
-        """Return some candidates with parameters estimated from their crops."""
+    ) -> dict[int, Detection]:
+        """Return those of some candidates by their indices that their crops show a primitive for, with parameters."""
         regions = [_region(part_of[i], boxes, i) for i in chosen.tolist()]
-        return [
-            Detection(primitive, float(boxes.score[i]), _box_in_metres(boxes, i, frame), self.estimator.crop(region))
+        return {
+            i: Detection(
+                primitive, float(boxes.score[i]), _box_in_metres(boxes, i, frame), self.estimator.crop(region)
+            )
             for i, region, primitive in zip(chosen.tolist(), regions, self.estimator(regions), strict=True)
-        ]
+            if primitive is not None
+        }
 
     def _doubtful(self, boxes: Boxes, eligible: NDArray[np.bool_], kept: NDArray[np.intp]) -> NDArray[np.intp]:
         """Return the best candidates with too small a score that no kept one overlaps, in descending order."""

@@ -44,7 +44,7 @@ class NetworkLimits:
     max_live_bytes: int = 192 << 20
     """Largest sum (bytes) of those of a run that are needed at a time."""
 
-    max_multiply_adds: float = 64e9
+    max_multiply_adds: float = 40e9
     """Largest number of multiply-adds of a run, or of as much other work."""
 
     max_known: int = 4096

@@ -111,7 +111,7 @@ class _Inference:
         _check("multiply-adds", costs.multiply_adds, limits.max_multiply_adds)
         for name, value in zip(node.outputs, outcome.values, strict=True):
             self._keep(name, value)
-        costs.live_bytes = max(costs.live_bytes, self._live + outcome.workspace * FLOAT.itemsize)
+        costs.live_bytes = max(costs.live_bytes, self._live)
         _check("bytes in use at a time", costs.live_bytes, limits.max_live_bytes)
         for name in {*node.inputs, *node.outputs}:
             if self._last_use.get(name, -1) <= i and name in self._values and not self._values[name].is_constant:

@@ -25,7 +25,7 @@ DType = np.dtype[Any]
 Attribute = int | float | bytes | tuple[int, ...] | tuple[float, ...] | Array
 """An attribute of a node: a number, a text, numbers or an array."""
 
-DTYPES = {
+DTYPES: Mapping[int, DType] = {
     1: np.dtype("<f4"), 6: np.dtype("<i4"), 7: np.dtype("<i8"), 9: np.dtype("?"), 10: np.dtype("<f2"),
     11: np.dtype("<f8"),
 }  # fmt: skip

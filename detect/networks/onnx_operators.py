@@ -45,14 +45,14 @@ FIXED: Mapping[str, tuple[Attribute, ...]] = {
 """The values that attributes may have where others would change shapes, or are not needed."""
 
 
-GROUPED_WORK = 8
-"""A multiply-add of a convolution in groups takes as long as this many others."""
+NARROW_FILTERS, NARROW_WORK = 8, 4
+"""A multiply-add of a convolution with fewer filters in a group than this takes as long as this many others."""
+
+CALL_WORK = 2000
+"""A convolution of one image in one group, or a product of two matrices, takes this many multiply-adds more."""
 
 POOLING_WORK = 4
 """So does a comparison or an addition of pooling."""
-
-PRODUCT_WORK = 1000
-"""A product of two small matrices takes this many multiply-adds more."""
 
 COSTLY = 32.0
 """Work for each element of a function that takes many steps."""
@@ -209,12 +209,10 @@ class Outcome:
     Attributes:
         values: Shapes and types of its outputs.
         work: Multiply-adds, or as much other work, beside a fixed share for each element that goes in and out.
-        workspace: Elements of arrays that are used while it runs.
     """
 
     values: tuple[Value, ...]
     work: float = 0.0
-    workspace: int = 0
 
 
 Infer = Callable[[Call], Outcome]
@@ -267,7 +265,7 @@ def infer(call: Call, max_known: int) -> Outcome:
     if operator.compute and len(known) == len(given) and values[0].elements <= max_known and values[0].data is None:
         values[0] = _computed(call, operator.compute, known, values[0])
     elements = sum(value.elements for value in (*given, *values))
-    return Outcome(tuple(values), outcome.work + operator.element_work * elements, outcome.workspace)
+    return Outcome(tuple(values), outcome.work + operator.element_work * elements)
 
 
 def _check_form(call: Call, operator: Operator) -> None:
@@ -600,28 +598,9 @@ def _conv(call: Call) -> Outcome:
     window = _Window.of(call, weight.shape[2:])
     shape = (value.shape[0], filters, *window.outputs(call, value.shape[2:]))
     size = depth * math.prod(window.kernel)
-    work = math.prod(shape) * size * (1 if group == 1 else GROUPED_WORK)
-    return Outcome((Value(shape, value.dtype),), work, size * math.prod(shape[2:]) if group > 1 else 0)
-
-
-def _conv_transpose(call: Call) -> Outcome:
-    value, weight = call.value(0), call.value(1)
-    group = call.integer("group", 1)
-    if len(value.shape) < 3 or len(weight.shape) != len(value.shape) or group != 1:
-        raise call.fail(f"has weights of shape {shown(weight.shape)} for {shown(value.shape)}")
-    depth, filters = weight.shape[:2]
-    if value.shape[1] != depth:
-        raise call.fail(f"has weights of shape {shown(weight.shape)} for {shown(value.shape)}")
-    _check_bias(call, filters)
-    window = _Window.of(call, weight.shape[2:])
-    rank = len(window.kernel)
-    sizes = [
-        (size - 1) * window.strides[i] + window.reach(i) - window.pads[i] - window.pads[i + rank]
-        for i, size in enumerate(value.shape[2:])
-    ]
-    shape = (value.shape[0], filters, *_sizes(call, sizes))
-    columns = filters * math.prod(window.kernel) * math.prod(value.shape[2:])
-    return Outcome((Value(shape, value.dtype),), value.shape[0] * depth * columns, columns)
+    narrow = filters // group < NARROW_FILTERS
+    work = math.prod(shape) * size * (NARROW_WORK if narrow else 1) + value.shape[0] * group * CALL_WORK
+    return Outcome((Value(shape, value.dtype),), work)
 
 
 def _pool(call: Call) -> Outcome:
@@ -638,8 +617,14 @@ def _global_pool(call: Call) -> Outcome:
     return Outcome((Value((*value.shape[:2], *(1 for _ in value.shape[2:])), value.dtype),))
 
 
+def _check_floats(call: Call, *values: Value) -> None:
+    if any(value.dtype.kind != "f" for value in values):
+        raise call.fail("multiplies matrices of integers, which takes long")
+
+
 def _matmul(call: Call) -> Outcome:
     value, other = call.value(0), call.value(1)
+    _check_floats(call, value, other)
     if not value.shape or not other.shape:
         raise call.fail("has a factor without dimensions")
     left = value.shape if len(value.shape) > 1 else (1, *value.shape)
@@ -655,6 +640,7 @@ def _matmul(call: Call) -> Outcome:
 
 def _gemm(call: Call) -> Outcome:
     value, other, added = call.value(0), call.value(1), call.optional(2)
+    _check_floats(call, value, other)
     if len(value.shape) != 2 or len(other.shape) != 2:
         raise call.fail(f"multiplies {shown(value.shape)} by {shown(other.shape)}")
     left = value.shape[::-1] if call.integer("transA", 0) else value.shape
@@ -667,7 +653,7 @@ def _gemm(call: Call) -> Outcome:
 
 def _product_work(batch: int, rows: int, inner: int, cols: int) -> float:
     """Return the work of products of matrices: as multiply-adds, with each product a few of them more."""
-    return batch * (rows * inner * cols + PRODUCT_WORK)
+    return batch * (rows * inner * cols + CALL_WORK)
 
 
 def _reduce(call: Call) -> Outcome:
@@ -702,7 +688,7 @@ def _filled(call: Call, arrays: Sequence[Array]) -> Array:
 
 def _counted(start: Array, limit: Array, delta: Array) -> Array:
     count = max(math.ceil(float((limit - start).item()) / float(delta.item())), 0)
-    return start.ravel()[0] + np.arange(count, dtype=start.dtype) * delta.ravel()[0]
+    return np.asarray(start.ravel()[0] + np.arange(count, dtype=start.dtype) * delta.ravel()[0])
 
 
 def _concatenated(call: Call, arrays: Sequence[Array]) -> Array:
@@ -778,7 +764,6 @@ OPERATORS: Mapping[str, Operator] = {
     ),
     # of windows, and of matrices
     "Conv": _of(_conv, (2, 3), WINDOW),
-    "ConvTranspose": _of(_conv_transpose, (2, 3), WINDOW),
     **_each("AveragePool MaxPool", _of(_pool, (1, 1), POOL)),
     **_each("GlobalAveragePool GlobalMaxPool", _of(_global_pool, (1, 1))),
     "MatMul": _of(_matmul, (2, 2)),
