@@ -54,8 +54,8 @@ CALL_WORK = 2000
 POOLING_WORK = 4
 """So does a comparison or an addition of pooling."""
 
-COSTLY = 32.0
-"""Work for each element of a function that takes many steps."""
+PLAIN_WORK, COSTLY, SOFTMAX_WORK = 16.0, 32.0, 128.0
+"""Work for each element that goes in or out: of most operators, of functions that take many steps, of Softmax."""
 
 
 @dataclass(frozen=True)
@@ -236,7 +236,7 @@ class Operator:
     inputs: tuple[int, int]
     attributes: frozenset[str] = frozenset()
     compute: Compute | None = None
-    element_work: float = 4.0
+    element_work: float = PLAIN_WORK
     max_outputs: int = 1
 
 
@@ -716,7 +716,7 @@ def _of(
     inputs: tuple[int, int],
     attributes: str = "",
     compute: Compute | None = None,
-    element_work: float = 4.0,
+    element_work: float = PLAIN_WORK,
     max_outputs: int = 1,
 ) -> Operator:
     return Operator(infer, inputs, frozenset(attributes.split()), compute, element_work, max_outputs)
@@ -754,9 +754,9 @@ OPERATORS: Mapping[str, Operator] = {
     "Min": _of(_broadcasting(), (1, MANY), compute=lambda call, arrays: reduce(np.minimum, arrays)),
     "Equal": _of(_broadcasting(BOOL), (2, 2), compute=_elementwise(np.equal)),
     **_each("And Greater GreaterOrEqual Less LessOrEqual Or", _of(_broadcasting(BOOL), (2, 2))),
-    "Where": _of(_broadcasting(), (3, 3), compute=_elementwise(np.where)),
+    "Where": _of(_broadcasting(), (3, 3), compute=_elementwise(np.where), element_work=COSTLY),
     # along an axis
-    "Softmax": _of(_axis_checked, (1, 1), "axis", element_work=COSTLY),
+    "Softmax": _of(_axis_checked, (1, 1), "axis", element_work=SOFTMAX_WORK),
     "BatchNormalization": _of(_vectors, (5, 5), "epsilon momentum training_mode"),
     **_each(
         "ReduceL2 ReduceMax ReduceMean ReduceMin ReduceSum",
