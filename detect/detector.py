@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from detect.detection import Detection, Detections, Rejection
 from detect.networks.cnn import ClassifiedRegion, ParameterEstimator
 from detect.networks.tiles import TILE_SIZE, clip_to_tile, tile_frames, tile_image
-from detect.networks.weights import Weights, load_weight_set
+from detect.networks.weights import BATCHES, Weights, load_weight_set
 from detect.networks.yolo import KINDS, Boxes, Yolo, box_iou, non_maximum_suppression
 from mapping.grid import GridFrame, OccupancyGrid
 from prim.errors import UsageError
@@ -46,14 +46,17 @@ class DetectorOptions:
     nms_iou: float = 0.45
     """Largest intersection over union of two detections' boxes: YOLOv5's default."""
 
+    max_per_tile: int = 100
+    """Largest number of detections in a tile, the best: as many as COCO's metric takes of an image."""
+
     max_overlap: float = 0.25
     """Largest intersection of two detections' outlines over the smaller one's area (no IoU); set by hand."""
 
     border: int = 2
     """Boxes this near (cells) to a tile's border, where the map goes on, are left to the next tile; set by hand."""
 
-    batch_size: int = 8
-    """Tiles in one batch of the network: it bounds memory; set by hand."""
+    batch_size: int = BATCHES["yolo"]
+    """Tiles in one batch of the network."""
 
 
 DEFAULTS = DetectorOptions()
@@ -158,17 +161,17 @@ class Detector:
             [self._is_whole(box, part.tile, frame) for box, part in zip(boxes.box, part_of, strict=True)], dtype=bool
         )
         suppressor = self._suppress(boxes, whole & (boxes.score >= thresholds), [len(part.boxes) for part in parts])
-        kept = np.flatnonzero(suppressor == np.arange(len(boxes)))
+        kept, excess = self._best_of_each_tile(suppressor == np.arange(len(boxes)), boxes, part_of)
         estimated = self._estimate(kept, boxes, part_of, frame)
         found, overlapping = _reject_overlapping(_best_first(estimated.values()), self.options.max_overlap)
-        rejections = {
-            i: _rejection(boxes, i, frame, self._reason(boxes, i, better, bool(whole[i])))
+        reasons = {
+            i: self._reason(boxes, i, better, bool(whole[i]))
             for i, better in enumerate(suppressor.tolist())
             if better != i
         }
-        for i in kept.tolist():
-            if i not in estimated:
-                rejections[i] = _rejection(boxes, i, frame, "its parameters are those of no primitive in its tile")
+        reasons |= dict.fromkeys(excess.tolist(), f"its tile has {self.options.max_per_tile} better ones")
+        reasons |= {i: "its tile holds no such primitive" for i in kept.tolist() if i not in estimated}
+        rejections = {i: _rejection(boxes, i, frame, reason) for i, reason in reasons.items()}
         chosen = self._doubtful(boxes, whole & (suppressor < 0), kept)
         doubtful = self._estimate(chosen, boxes, part_of, frame)
         return Detections(
@@ -211,6 +214,19 @@ class Detector:
         if len(per_tile) > 1:
             suppressor[rest] = rest[non_maximum_suppression(boxes[rest], self.options.nms_iou)]
         return suppressor
+
+    def _best_of_each_tile(
+        self, kept: NDArray[np.bool_], boxes: Boxes, part_of: Sequence[_TileCandidates]
+    ) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+        """Split the indices of kept candidates into those of the best in each tile, and the rest."""
+        counts: dict[tuple[int, int], int] = {}
+        chosen = np.zeros(len(boxes), np.bool_)
+        indices = np.flatnonzero(kept)
+        for i in indices[np.argsort(-boxes.score[indices], kind="stable")].tolist():
+            tile = part_of[i].tile.row, part_of[i].tile.col
+            counts[tile] = counts.get(tile, 0) + 1
+            chosen[i] = counts[tile] <= self.options.max_per_tile
+        return np.flatnonzero(chosen), np.flatnonzero(kept & ~chosen)
 
     def _estimate(
         self, chosen: NDArray[np.intp], boxes: Boxes, part_of: Sequence[_TileCandidates], frame: GridFrame

@@ -341,18 +341,18 @@ def write_network(network: Network) -> bytes:
         The file: without names of nodes, documentation, declared shapes of tensors within, and other outputs.
     """
     graph = [
-        *(_bytes(1, _write_node(node)) for node in network.nodes),
-        _bytes(2, b"prim"),
-        *(_bytes(5, _write_array(name, array)) for name, array in network.constants.items()),
-        _bytes(11, _write_port(network.input)),
-        _bytes(12, _write_port(network.output)),
+        *(bytes_field(1, write_node(node)) for node in network.nodes),
+        bytes_field(2, b"prim"),
+        *(bytes_field(5, write_array(name, array)) for name, array in network.constants.items()),
+        bytes_field(11, write_port(network.input)),
+        bytes_field(12, write_port(network.output)),
     ]
     return b"".join(
         [
-            _integer(1, max(network.ir_version, MIN_IR_VERSION)),
-            _bytes(8, _integer(2, network.opset)),
-            *(_bytes(14, _text(1, key) + _text(2, value)) for key, value in network.metadata.items()),
-            _bytes(7, b"".join(graph)),
+            integer_field(1, max(network.ir_version, MIN_IR_VERSION)),
+            bytes_field(8, integer_field(2, network.opset)),
+            *(bytes_field(14, text_field(1, key) + text_field(2, value)) for key, value in network.metadata.items()),
+            bytes_field(7, b"".join(graph)),
         ]
     )
 
@@ -366,52 +366,84 @@ def _write_varint(value: int) -> bytes:
     return bytes([*parts, value])
 
 
-def _integer(number: int, value: int) -> bytes:
+def integer_field(number: int, value: int) -> bytes:
+    """Write a field of a message.
+
+    Args:
+        number: Its number.
+        value: An integer of up to 64 bits.
+
+    Returns:
+        The field.
+    """
     return _write_varint(number << 3 | VARINT) + _write_varint(value)
 
 
-def _bytes(number: int, data: bytes) -> bytes:
+def bytes_field(number: int, data: bytes) -> bytes:
+    """Write a field of a message.
+
+    Args:
+        number: Its number.
+        data: Bytes, among them those of another message.
+
+    Returns:
+        The field.
+    """
     return _write_varint(number << 3 | BYTES) + _write_varint(len(data)) + data
 
 
-def _text(number: int, text: str) -> bytes:
-    return _bytes(number, text.encode())
+def text_field(number: int, text: str) -> bytes:
+    """See :func:`bytes_field`."""
+    return bytes_field(number, text.encode())
 
 
 def _texts(number: int, texts: Sequence[str]) -> bytes:
-    return b"".join(_text(number, text) for text in texts)
+    return b"".join(text_field(number, text) for text in texts)
 
 
-def _write_node(node: Node) -> bytes:
-    attributes = [_bytes(5, _write_attribute(name, value)) for name, value in node.attributes.items()]
-    return _texts(1, node.inputs) + _texts(2, node.outputs) + _text(4, node.operator) + b"".join(attributes)
+def write_node(node: Node) -> bytes:
+    """Return a node as a message (NodeProto)."""
+    attributes = [bytes_field(5, _write_attribute(name, value)) for name, value in node.attributes.items()]
+    return _texts(1, node.inputs) + _texts(2, node.outputs) + text_field(4, node.operator) + b"".join(attributes)
 
 
 def _write_attribute(name: str, value: Attribute) -> bytes:
     """Return an AttributeProto; an empty tuple is one of integers."""
     if isinstance(value, int):
-        kind, content = INT, _integer(3, value)
+        kind, content = INT, integer_field(3, value)
     elif isinstance(value, float):
         kind, content = FLOAT, _write_varint(2 << 3 | FIXED32) + struct.pack("<f", value)
     elif isinstance(value, bytes):
-        kind, content = STRING, _bytes(4, value)
+        kind, content = STRING, bytes_field(4, value)
     elif isinstance(value, np.ndarray):
-        kind, content = TENSOR, _bytes(5, _write_array("", value))
+        kind, content = TENSOR, bytes_field(5, write_array("", value))
     elif value and isinstance(value[0], float):
-        kind, content = FLOATS, _bytes(7, np.array(value, "<f4").tobytes())
+        kind, content = FLOATS, bytes_field(7, np.array(value, "<f4").tobytes())
     else:
-        kind, content = INTS, b"".join(_integer(8, int(item)) for item in value)
-    return _text(1, name) + content + _integer(20, kind)
+        kind, content = INTS, b"".join(integer_field(8, int(item)) for item in value)
+    return text_field(1, name) + content + integer_field(20, kind)
 
 
-def _write_array(name: str, array: Array) -> bytes:
-    sizes = b"".join(_integer(1, size) for size in array.shape)
-    return sizes + _integer(2, DTYPE_NUMBERS[array.dtype]) + _text(8, name) + _bytes(9, array.tobytes())
+def write_array(name: str, array: Array) -> bytes:
+    """Write an array as a message (TensorProto).
+
+    Args:
+        name: Its name.
+        array: Its elements, of one of DTYPES.
+
+    Returns:
+        The message.
+    """
+    sizes = b"".join(integer_field(1, size) for size in array.shape)
+    return (
+        sizes + integer_field(2, DTYPE_NUMBERS[array.dtype]) + text_field(8, name) + bytes_field(9, array.tobytes())
+    )
 
 
-def _write_port(port: Port) -> bytes:
-    tensor = _integer(1, DTYPE_NUMBERS[port.dtype])
+def write_port(port: Port) -> bytes:
+    """Return an input or output of a graph as a message (ValueInfoProto)."""
+    tensor = integer_field(1, DTYPE_NUMBERS[port.dtype])
     if port.shape is not None:
-        sizes = [_integer(1, size) if isinstance(size, int) else _text(2, size) for size in port.shape]
-        tensor += _bytes(2, b"".join(_bytes(1, size) for size in sizes))
-    return _text(1, port.name) + _bytes(2, _bytes(1, tensor))
+        sizes = [integer_field(1, size) if isinstance(size, int) else text_field(2, size) for size in port.shape]
+        tensor += bytes_field(2, b"".join(bytes_field(1, size) for size in sizes))
+    return text_field(1, port.name) + bytes_field(2, bytes_field(1, tensor))

@@ -24,8 +24,8 @@ MAX_REACH = 512
 """Boxes that reach farther (cells) beyond their tile are dropped: what the head can say ends at 15 times its largest
 stride of 32 cells."""
 
-MAX_LOCATIONS = 16384
-"""Largest number of locations that a detector may have: four times those of strides from 4 on; set by hand."""
+MAX_LOCATIONS = sum((TILE_SIZE // stride) ** 2 for stride in (4, 8, 16, 32))
+"""Largest number of locations that a detector may have: those of a head with all strides from 4 to 32."""
 
 
 @dataclass(frozen=True)
