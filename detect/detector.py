@@ -46,6 +46,9 @@ class DetectorOptions:
     nms_iou: float = 0.45
     """Largest intersection over union of two detections' boxes: YOLOv5's default."""
 
+    max_candidates: int = 1200
+    """Largest number of candidates of a tile, the best; the shipped networks have 1029 at most."""
+
     max_per_tile: int = 100
     """Largest number of detections in a tile, the best: as many as COCO's metric takes of an image."""
 
@@ -187,6 +190,9 @@ class Detector:
             for (tile, image), boxes in zip(batch, self.yolo(stacked, self.options.score_floor), strict=True):
                 if len(boxes):
                     grey = np.ascontiguousarray(image[..., 0])
+                    if len(boxes) > self.options.max_candidates:
+                        best = np.argsort(-boxes.score, kind="stable")[: self.options.max_candidates]
+                        boxes = boxes[np.sort(best)]
                     yield _TileCandidates(tile, grey, boxes.translated(tile.col, tile.row))
 
     def _is_whole(self, box: NDArray[np.float32], tile: GridFrame, frame: GridFrame) -> bool:

@@ -139,7 +139,7 @@ class _Inference:
 
 def _check(what: str, size: float, limit: float) -> None:
     if size > limit:
-        raise GraphError(f"it takes {what}: {size:.3g}, more than {limit:.3g}")
+        raise GraphError(f"it takes {what}: {size:.4g}, more than {limit:.4g}")
 
 
 def _sizes_of(array: Array, max_known: int) -> Array:

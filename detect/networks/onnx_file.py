@@ -313,9 +313,13 @@ def _named_array(message: _Message) -> tuple[str, Array]:
         raise GraphError(f"its array {shown(name)} is in another file: store all in one")
     dtype, shape = _dtype(message.integer(2)), message.integers(1)
     values = _elements(message, dtype)
+    error = GraphError(f"its array {shown(name)} of shape {shown(shape)} has {len(values)} elements")
     if any(size < 0 for size in shape) or math.prod(shape) != len(values):
-        raise GraphError(f"its array {shown(name)} of shape {shown(shape)} has {len(values)} elements")
-    return name, values.reshape(shape)
+        raise error
+    try:
+        return name, values.reshape(shape)
+    except ValueError:  # more dimensions than an array can have, or larger ones
+        raise error from None
 
 
 def _elements(message: _Message, dtype: DType) -> Array:

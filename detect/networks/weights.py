@@ -52,6 +52,7 @@ CHANNELS = 3
 BATCHES = {"yolo": 8, "cnn": 32}
 """The most images of each stage that a network is run on at a time: it bounds memory; set by hand."""
 
+ANOTHER = "use a network that prim-train export made"
 AGAIN = "make it anew with prim-train export"
 
 
@@ -187,7 +188,7 @@ class Weights:
             found = self.session.run(None, {self.session.get_inputs()[0].name: images})[0]
             outputs = np.asarray(found, dtype=np.float32)
         except GraphError as error:
-            raise WeightsError(f"{self.path} cannot be used: {error}; {AGAIN}") from error
+            raise WeightsError(f"{self.path} cannot be used: {error}; {ANOTHER}") from error
         except Exception as error:  # ONNX Runtime raises undocumented exceptions of many types
             shape = " x ".join(map(str, images.shape))
             raise WeightsError(f"{self.path} does not take images of {shape}, as its card says: {AGAIN}") from error
@@ -223,7 +224,7 @@ def load_weights(
     try:
         network = read_network(content, limits)
     except GraphError as error:
-        raise WeightsError(f"{path} cannot be used: {error}; {AGAIN}") from error
+        raise WeightsError(f"{path} cannot be used: {error}; {ANOTHER}") from error
     card = _card(path, network.metadata.get(CARD_KEY, "null"), limits)
     if card.stage != stage:
         raise WeightsError(f"{path} is a network for {card.stage}, not for {stage}")
@@ -235,7 +236,7 @@ def load_weights(
             check(card.input_shape(batch))
         return Weights(path, card, _session(write_network(network), threads), check)
     except GraphError as error:
-        raise WeightsError(f"{path} cannot be used: {error}; {AGAIN}") from error
+        raise WeightsError(f"{path} cannot be used: {error}; {ANOTHER}") from error
     except Exception as error:  # ONNX Runtime raises undocumented exceptions of many types
         raise WeightsError(f"{path} is no ONNX network, or a damaged one: {AGAIN}") from error
 
