@@ -735,7 +735,8 @@ POOL = "auto_pad ceil_mode count_include_pad dilations kernel_shape pads storage
 
 OPERATORS: Mapping[str, Operator] = {
     # of each element
-    **_each("Erf Exp Log Mish Sigmoid Softplus Softsign Sqrt Tanh", _of(_same, (1, 1), element_work=COSTLY)),
+    **_each("Erf Exp Log Sigmoid Softsign Sqrt Tanh", _of(_same, (1, 1), element_work=COSTLY)),
+    **_each("Mish Softplus", _of(_same, (1, 1), element_work=2 * COSTLY)),
     **_each("Elu HardSigmoid LeakyRelu Selu", _of(_same, (1, 1), "alpha beta gamma", element_work=COSTLY)),
     **_each("Abs HardSwish Neg Not Reciprocal Relu Round Sign", _of(_same, (1, 1))),
     "Ceil": _of(_same, (1, 1), compute=_elementwise(np.ceil)),
@@ -749,7 +750,7 @@ OPERATORS: Mapping[str, Operator] = {
     "Sub": _of(_broadcasting(), (2, 2), compute=_elementwise(np.subtract)),
     "Mul": _of(_broadcasting(), (2, 2), compute=_elementwise(np.multiply)),
     "Div": _of(_division, (2, 2), compute=_quotient),
-    "Pow": _of(_broadcasting(), (2, 2), element_work=COSTLY),
+    "Pow": _of(_broadcasting(), (2, 2), element_work=2 * COSTLY),
     "Max": _of(_broadcasting(), (1, MANY), compute=lambda call, arrays: reduce(np.maximum, arrays)),
     "Min": _of(_broadcasting(), (1, MANY), compute=lambda call, arrays: reduce(np.minimum, arrays)),
     "Equal": _of(_broadcasting(BOOL), (2, 2), compute=_elementwise(np.equal)),
