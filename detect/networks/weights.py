@@ -8,7 +8,7 @@ from __future__ import annotations
 import os
 import shlex
 from collections.abc import Mapping
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -234,7 +234,7 @@ def load_weights(
     try:
         for batch in (1, BATCHES[stage]):
             check(card.input_shape(batch))
-        return Weights(path, card, _session(write_network(network), threads), check)
+        return Weights(path, card, _session(write_network(replace(network, metadata={})), threads), check)
     except GraphError as error:
         raise WeightsError(f"{path} cannot be used: {error}; {ANOTHER}") from error
     except Exception as error:  # ONNX Runtime raises undocumented exceptions of many types

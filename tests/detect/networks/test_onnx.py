@@ -88,10 +88,21 @@ def test_shapes_of_all_tensors_are_those_of_onnx_runtime() -> None:
 
 
 WEIGHT = np.ones((4, 3, 3, 3), np.float32)
-CASES: list[tuple[Node | Sequence[Node], dict[str, NDArray[np.generic]]]] = [
-    *[(node(name, "images"), {}) for name in ["Abs", "Ceil", "Elu", "Erf", "Exp", "Floor", "HardSigmoid", "HardSwish", "Identity", "LeakyRelu", "Log", "Neg", "Reciprocal", "Relu", "Round", "Selu", "Sigmoid", "Sign", "Softplus", "Softsign", "Sqrt", "Tanh", "GlobalAveragePool", "GlobalMaxPool", "Transpose", "Flatten", "Softmax", "Clip", "Mish"]],
-    *[(node(name, "images images"), {}) for name in ["Add", "Sub", "Mul", "Div", "Pow", "Max", "Min"]],
-    *[([node(name, "images images", "c"), node("Cast", "c", to=1)], {}) for name in ["Equal", "Greater", "GreaterOrEqual", "Less", "LessOrEqual"]],
+UNARY = (
+    "Abs Ceil Clip Elu Erf Exp Flatten Floor GlobalAveragePool GlobalMaxPool HardSigmoid HardSwish Identity "
+    "LeakyRelu Log Mish Neg Reciprocal Relu Round Selu Sigmoid Sign Softmax Softplus Softsign Sqrt Tanh Transpose"
+)
+BINARY = ["Add", "Sub", "Mul", "Div", "Pow", "Max", "Min"]
+COMPARISONS = ["Equal", "Greater", "GreaterOrEqual", "Less", "LessOrEqual"]
+REDUCTIONS = ["ReduceL2", "ReduceMax", "ReduceMean", "ReduceMin"]
+
+Case = tuple[Node | Sequence[Node], dict[str, NDArray[np.generic]]]
+
+CASES: list[Case] = [
+    *((node(name, "images"), {}) for name in UNARY.split()),
+    *((node(name, "images images"), {}) for name in BINARY),
+    *(([node(name, "images images", "c"), node("Cast", "c", to=1)], {}) for name in COMPARISONS),
+    *((node(name, "images", axes=(-1, 1), keepdims=i % 2), {}) for i, name in enumerate(REDUCTIONS)),
     ([node("Greater", "images one", "c"), node("Not", "c", "d"), node("And", "c d", "e"), node("Or", "c e", "f"),
       node("Where", "f seen images")], {"one": floats(1)}),
     (node("Add", "images other"), {"other": np.ones((5, 1, 3, 1, 224), np.float32)}),
@@ -107,20 +118,18 @@ CASES: list[tuple[Node | Sequence[Node], dict[str, NDArray[np.generic]]]] = [
     (node("MatMul", "w images"), {"w": np.ones(224, np.float32)}),
     ([node("Flatten", "images", "a"), node("Gemm", "w a c", transA=1, transB=1)],
      {"w": np.ones((3 * 224 * 224, 2), np.float32), "c": floats(1)}),
-    *[(node(name, "images", axes=(-1, 1), keepdims=keep), {}) for keep, name in enumerate(
-        ["ReduceL2", "ReduceMax", "ReduceMean", "ReduceMin"])],
     (node("ReduceSum", "images axes", keepdims=0), {"axes": integers(0, 2)}),
     (node("ReduceSum", "images -"), {}),
     (node("Constant", "", value=np.ones((3, 2), np.float32)), {}),
     (node("ConstantOfShape", "s"), {"s": integers(3, 5)}),
     ([node("Shape", "images", "s", start=1, end=-1), node("Cast", "s", to=1)], {}),
-    (node("Range", "a b c"), {"a": np.array(7, np.float32), "b": np.array(-1, np.float32), "c": np.array(-0.7, np.float32)}),
-    ([node("Range", "a b c", "r"), node("Cast", "r", to=1)],
-     {name: np.array(value) for name, value in (("a", -3), ("b", 8), ("c", 3))}),
+    (node("Range", "a b c"), {"a": np.full((), 7, np.float32), "b": np.array(-1, "f4"), "c": np.array(-0.7, "f4")}),
+    ([node("Range", "a b c", "r"), node("Cast", "r", to=1)], {"a": np.array(-3), "b": np.array(8), "c": np.array(3)}),
     (node("Reshape", "images s"), {"s": integers(0, -1, 7, 4)}),
     ([node("Unsqueeze", "images a", "u"), node("Squeeze", "u b")], {"a": integers(0, -1), "b": integers(0)}),
     ([node("Slice", "images a b c d", "u"), node("Squeeze", "u")],
-     {"a": integers(-1, 5, 1), "b": integers(-(1 << 62), 1 << 62, 2), "c": integers(-1, 2, 1), "d": integers(-3, 7, 1)}),
+     {"a": integers(-1, 5, 1), "b": integers(-(1 << 62), 1 << 62, 2), "c": integers(-1, 2, 1),
+      "d": integers(-3, 7, 1)}),
     (node("Transpose", "images", perm=(2, 0, 3, 1)), {}),
     (node("Concat", "images w images", axis=-2), {"w": np.ones((1, 3, 9, 224), np.float32)}),
     (node("Split", "images sizes", "more out", axis=2), {"sizes": integers(100, 124)}),
@@ -142,9 +151,7 @@ CASES: list[tuple[Node | Sequence[Node], dict[str, NDArray[np.generic]]]] = [
 
 
 @pytest.mark.parametrize("case", CASES, ids=lambda case: case[0].operator if isinstance(case[0], Node) else "chain")
-def test_operators_give_the_shapes_of_onnx_runtime(
-    case: tuple[Node | Sequence[Node], dict[str, NDArray[np.generic]]],
-) -> None:
+def test_operators_give_the_shapes_of_onnx_runtime(case: Case) -> None:
     nodes, constants = case
     made = network([nodes] if isinstance(nodes, Node) else nodes, **constants)
     made = replace(made, opset=18 if isinstance(nodes, Node) and nodes.operator == "Mish" else made.opset)
@@ -191,13 +198,14 @@ def test_operators_of_older_sets_take_axes_as_attributes() -> None:
         ([node("ConstantOfShape", "s")], {"s": integers(1 << 20, 1 << 20)}, "more than"),
         ([node("ConstantOfShape", "s")], {"s": integers(1, -1)}, "a tensor of shape"),
         ([node("Expand", "seen s")], {"s": integers(1 << 62, 1 << 62)}, "more than"),
-        ([node("Reshape", "images s")], {"s": integers(-1, 0, 0, 0, 5)}, "Reshape has an axis 4"),
+        ([node("Reshape", "images s")], {"s": integers(0, 0, 0, 0, 0)}, "Reshape has an axis 4"),
         ([node("Reshape", "images s")], {"s": integers(-1, -1)}, "a tensor of shape"),
         ([node("Cast", "seen", "w", to=7), node("Div", "w z", "q"), node("Cast", "q", to=1)], {"z": integers(0)},
          "divides by an integer that is not positive"),
-        ([node("Cast", "seen", "w", to=7), node("Div", "w w", "q"), node("Cast", "q", to=1)], {}, "depends on the image"),
-        ([node("Cast", "seen", "w", to=7), node("Reshape", "w m", "s"), node("Expand", "seen s")], {"m": integers(-1)},
-         "its Expand has a size that depends on the image"),
+        ([node("Cast", "seen", "w", to=7), node("Div", "w w", "q"), node("Cast", "q", to=1)], {},
+         "its Div has a size that depends on the image"),
+        ([node("Cast", "seen", "w", to=7), node("Reshape", "w m", "s"), node("Expand", "seen s")],
+         {"m": integers(-1)}, "its Expand has a size that depends on the image"),
         ([node("Gather", "images i", axis=1)], {"i": integers(3)}, "its Gather has an axis 3 of 3"),
         ([node("Slice", "images a a a a")], {"a": integers(0)}, "bounds that do not fit"),
         ([node("Cast", "seen", to=8)], {}, "casts to type 8"),
@@ -215,7 +223,7 @@ def test_each_bound_holds() -> None:
     made = network([node("ConstantOfShape", "s", "c"), node("Add", "images c")], s=integers(3, 224, 224))
     costs = check_network(made, TILES)
     image = 3 * 224 * 224
-    assert costs.constant_bytes == 4 * image + 16 + 24  # and the constants that the network holds
+    assert costs.constant_bytes == 4 * image + 8 + 24  # and the constants that the network holds
     assert costs.activation_bytes == pytest.approx(2 * 4 * image, abs=16)
     assert costs.live_bytes == pytest.approx(2 * 4 * image, abs=16)
     for name, value in {
@@ -256,7 +264,7 @@ def test_subgraphs_functions_and_other_sets_of_operators_are_refused() -> None:
     inner = bytes_field(1, write_node(node("Relu", "a", "b")))
     for kind, field in ((5, 6), (10, 11), (0, 6)):
         attribute = bytes_field(1, b"body") + bytes_field(field, inner) + integer_field(20, kind)
-        with pytest.raises(GraphError, match='"Loop" has .*subgraph'):
+        with pytest.raises(GraphError, match=r'"Loop" has .*subgraph'):
             read_network(raw_network([write_node(node("Loop", "seen")) + bytes_field(5, attribute)]))
     with pytest.raises(GraphError, match="functions"):
         read_network(raw_network([], model=bytes_field(25, b"")))
@@ -274,15 +282,12 @@ def test_arrays_are_read_from_all_their_fields() -> None:
     for dtype, field, expected in (
         (1, bytes_field(4, packed), [1.5, -2.0]),
         (11, bytes_field(10, struct.pack("<2d", 1.5, -2.0)), [1.5, -2.0]),
-        (10, bytes_field(5, b"\x80\x7c\x80\x80\x03"), [1.0, -0.0]),
+        (10, bytes_field(5, b"\x80\x78\x80\x80\x02"), [1.0, -0.0]),  # 0x3c00, 0x8000
         (7, integer_field(7, -3) + integer_field(7, 4), [-3, 4]),
         (6, bytes_field(5, b"\x05\x06"), [5, 6]),
         (9, bytes_field(9, b"\x07\x00"), [True, False]),
     ):
         array = integer_field(1, 2) + integer_field(2, dtype) + bytes_field(8, b"w") + field
-        if dtype == 10:
-            field_of_half = bytes_field(5, b"\x80\x78\x80\x80\x02")  # 0x3c00, 0x8000
-            array = integer_field(1, 2) + integer_field(2, dtype) + bytes_field(8, b"w") + field_of_half
         found = read_network(raw_network([], graph=bytes_field(5, array))).constants["w"]
         assert found.tolist() == expected, dtype
 
