@@ -191,7 +191,7 @@ class Call:
             position: Which input.
 
         Returns:
-            The axes in ascending order; None where there are none given.
+            The axes in ascending order; None where there are none.
         """
         if as_input:
             given = None if self.optional(position) is None else self.known_integers(position)
@@ -202,7 +202,7 @@ class Call:
         axes = sorted(self.axis(axis, rank) for axis in given)
         if len(set(axes)) < len(axes):
             raise self.fail("has an axis twice")
-        return tuple(axes)
+        return tuple(axes) or None
 
 
 @dataclass(frozen=True)
@@ -391,10 +391,15 @@ def _range(call: Call) -> Outcome:
     if any(part.size != 1 or part.dtype != start.dtype for part in (start, limit, delta)):
         raise call.fail("has bounds that are no single numbers")
     with np.errstate(all="ignore"):
-        span, step = float((limit - start).item()), float(delta.item())
-    if not math.isfinite(span) or not math.isfinite(step) or step == 0 or not math.isfinite(span / step):
+        steps = _steps(start, limit, delta)
+    if not math.isfinite(steps):
         raise call.fail("has bounds or a step without meaning")
-    return Outcome((Value(_sizes(call, [math.ceil(span / step)]), start.dtype),))
+    return Outcome((Value(_sizes(call, [math.ceil(steps)]), start.dtype),))
+
+
+def _steps(start: Array, limit: Array, delta: Array) -> float:
+    """Return how many steps lead from start to limit, in the precision of the bounds as ONNX Runtime does."""
+    return float(((limit - start) / delta).item())
 
 
 def _reshape(call: Call) -> Outcome:
@@ -690,7 +695,7 @@ def _filled(call: Call, arrays: Sequence[Array]) -> Array:
 
 
 def _counted(start: Array, limit: Array, delta: Array) -> Array:
-    count = max(math.ceil(float((limit - start).item()) / float(delta.item())), 0)
+    count = math.ceil(_steps(start, limit, delta))
     return np.asarray(start.ravel()[0] + np.arange(count, dtype=start.dtype) * delta.ravel()[0])
 
 
