@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from detect.detection import Detection, Detections, Rejection
 from detect.networks.cnn import ClassifiedRegion, ParameterEstimator
 from detect.networks.tiles import TILE_SIZE, clip_to_tile, tile_frames, tile_image
-from detect.networks.weights import Weights, load_weight_set
+from detect.networks.weights import BATCHES, Weights, load_weight_set
 from detect.networks.yolo import KINDS, Boxes, Yolo, box_iou, non_maximum_suppression
 from mapping.grid import GridFrame, OccupancyGrid
 from prim.errors import UsageError
@@ -46,14 +46,20 @@ class DetectorOptions:
     nms_iou: float = 0.45
     """Largest intersection over union of two detections' boxes: YOLOv5's default."""
 
+    max_candidates: int = 1200
+    """Largest number of candidates of a tile, the best; the shipped networks have 1029 at most."""
+
+    max_per_tile: int = 100
+    """Largest number of detections in a tile, the best: as many as COCO's metric takes of an image."""
+
     max_overlap: float = 0.25
     """Largest intersection of two detections' outlines over the smaller one's area (no IoU); set by hand."""
 
     border: int = 2
     """Boxes this near (cells) to a tile's border, where the map goes on, are left to the next tile; set by hand."""
 
-    batch_size: int = 8
-    """Tiles in one batch of the network: it bounds memory; set by hand."""
+    batch_size: int = BATCHES["yolo"]
+    """Tiles in one batch of the network."""
 
 
 DEFAULTS = DetectorOptions()
@@ -158,19 +164,24 @@ class Detector:
             [self._is_whole(box, part.tile, frame) for box, part in zip(boxes.box, part_of, strict=True)], dtype=bool
         )
         suppressor = self._suppress(boxes, whole & (boxes.score >= thresholds), [len(part.boxes) for part in parts])
-        kept = np.flatnonzero(suppressor == np.arange(len(boxes)))
-        measured = _best_first(self._estimate(kept, boxes, part_of, frame))
-        found, overlapping = _reject_overlapping(measured, self.options.max_overlap)
-        rejections = {
-            i: _rejection(boxes, i, frame, self._reason(boxes, i, better, bool(whole[i])))
+        kept, excess = self._best_of_each_tile(suppressor == np.arange(len(boxes)), boxes, part_of)
+        estimated = self._estimate(kept, boxes, part_of, frame)
+        found, overlapping = _reject_overlapping(_best_first(estimated.values()), self.options.max_overlap)
+        reasons = {
+            i: self._reason(boxes, i, better, bool(whole[i]))
             for i, better in enumerate(suppressor.tolist())
             if better != i
         }
+        reasons |= dict.fromkeys(excess.tolist(), f"its tile has {self.options.max_per_tile} better ones")
+        reasons |= {i: "its tile holds no such primitive" for i in kept.tolist() if i not in estimated}
+        rejections = {i: _rejection(boxes, i, frame, reason) for i, reason in reasons.items()}
         chosen = self._doubtful(boxes, whole & (suppressor < 0), kept)
-        doubtful = zip(
-            self._estimate(chosen, boxes, part_of, frame), [rejections[i] for i in chosen.tolist()], strict=True
+        doubtful = self._estimate(chosen, boxes, part_of, frame)
+        return Detections(
+            found,
+            _best_first([*overlapping, *rejections.values()]),
+            tuple((detection, rejections[i]) for i, detection in doubtful.items()),
         )
-        return Detections(found, _best_first([*overlapping, *rejections.values()]), tuple(doubtful))
 
     def _candidates(self, images: Iterable[tuple[GridFrame, NDArray[np.uint8]]]) -> Iterator[_TileCandidates]:
         """Run YOLO on tiles; yield those with candidates."""
@@ -179,6 +190,9 @@ class Detector:
             for (tile, image), boxes in zip(batch, self.yolo(stacked, self.options.score_floor), strict=True):
                 if len(boxes):
                     grey = np.ascontiguousarray(image[..., 0])
+                    if len(boxes) > self.options.max_candidates:
+                        best = np.argsort(-boxes.score, kind="stable")[: self.options.max_candidates]
+                        boxes = boxes[np.sort(best)]
                     yield _TileCandidates(tile, grey, boxes.translated(tile.col, tile.row))
 
     def _is_whole(self, box: NDArray[np.float32], tile: GridFrame, frame: GridFrame) -> bool:
@@ -207,15 +221,31 @@ class Detector:
             suppressor[rest] = rest[non_maximum_suppression(boxes[rest], self.options.nms_iou)]
         return suppressor
 
+    def _best_of_each_tile(
+        self, kept: NDArray[np.bool_], boxes: Boxes, part_of: Sequence[_TileCandidates]
+    ) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+        """Split the indices of kept candidates into those of the best in each tile, and the rest."""
+        counts: dict[tuple[int, int], int] = {}
+        chosen = np.zeros(len(boxes), np.bool_)
+        indices = np.flatnonzero(kept)
+        for i in indices[np.argsort(-boxes.score[indices], kind="stable")].tolist():
+            tile = part_of[i].tile.row, part_of[i].tile.col
+            counts[tile] = counts.get(tile, 0) + 1
+            chosen[i] = counts[tile] <= self.options.max_per_tile
+        return np.flatnonzero(chosen), np.flatnonzero(kept & ~chosen)
+
     def _estimate(
         self, chosen: NDArray[np.intp], boxes: Boxes, part_of: Sequence[_TileCandidates], frame: GridFrame
-    ) -> list[Detection]:
-        """Return some candidates with parameters estimated from their crops."""
+    ) -> dict[int, Detection]:
+        """Return those of some candidates by their indices that their crops show a primitive for, with parameters."""
         regions = [_region(part_of[i], boxes, i) for i in chosen.tolist()]
-        return [
-            Detection(primitive, float(boxes.score[i]), _box_in_metres(boxes, i, frame), self.estimator.crop(region))
+        return {
+            i: Detection(
+                primitive, float(boxes.score[i]), _box_in_metres(boxes, i, frame), self.estimator.crop(region)
+            )
             for i, region, primitive in zip(chosen.tolist(), regions, self.estimator(regions), strict=True)
-        ]
+            if primitive is not None
+        }
 
     def _doubtful(self, boxes: Boxes, eligible: NDArray[np.bool_], kept: NDArray[np.intp]) -> NDArray[np.intp]:
         """Return the best candidates with too small a score that no kept one overlaps, in descending order."""

@@ -130,10 +130,11 @@ def evaluate_detector(detector: Detector, samples: Sequence[Sample], progress: P
         whole, whole_time = _timed(partial(detector.detect_tiles, tile, sample.frame))
         times += yolo_time, parameters_time, whole_time
         scored += scored_candidates(detector.yolo, [labelled])
-        at_true_boxes += zip(estimates, sample.primitives, strict=True)
-        found = [detection.primitive for detection in whole.found]
-        detections += len(found)
-        detected += matched_pairs(found, sample.primitives)
+        estimated = zip(estimates, sample.primitives, strict=True)
+        at_true_boxes += [(found, truth) for found, truth in estimated if found is not None]
+        primitives = [detection.primitive for detection in whole.found]
+        detections += len(primitives)
+        detected += matched_pairs(primitives, sample.primitives)
         kinds_right += _kinds_at_true_boxes(whole.found, sample)
         if progress:
             progress(done, len(samples))

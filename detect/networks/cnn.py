@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -10,9 +11,12 @@ from numpy.typing import NDArray
 
 from detect.networks.parameters import PRESETS, Preset, crop_box, decode_parameters
 from detect.networks.tiles import Box
-from detect.networks.weights import Weights, WeightsError
+from detect.networks.weights import BATCHES, Weights, WeightsError
 from mapping.grid import GridFrame
 from prim.shapes import Kind, Primitive
+
+MAX_OUTPUT = 1000.0
+"""Outputs beyond this encode no primitive: lengths of 400 m. Set by hand."""
 
 
 @dataclass(frozen=True)
@@ -48,25 +52,41 @@ class ParameterEstimator:
         """Return the input (pixels, pixels) of the kind's network."""
         return crop_box(region.grey, region.box, self._network_of[region.kind].preset)
 
-    def __call__(self, regions: Sequence[ClassifiedRegion]) -> list[Primitive]:
-        """Estimate the primitives in regions; they are returned in the order given, map frame.
+    def __call__(self, regions: Sequence[ClassifiedRegion]) -> list[Primitive | None]:
+        """Estimate the primitives in regions.
+
+        Args:
+            regions: The regions.
+
+        Returns:
+            The primitives in the order given, map frame; None where a network's outputs are those of none that its
+            tile holds.
 
         Raises:
-            WeightsError: A network gives outputs that are not finite.
+            WeightsError: A network does not take its crops, or gives outputs that are not finite.
         """
-        primitives: dict[int, Primitive] = {}
+        primitives: dict[int, Primitive | None] = {}
         for network in self._networks:
             chosen = [i for i in range(len(regions)) if self._network_of[regions[i].kind] is network]
             if not chosen:
                 continue
             outputs = network.run(np.stack([self.crop(regions[i]) for i in chosen]))
-            if not np.isfinite(outputs).all():
-                raise WeightsError(f"{network.weights.path} gives no numbers for a crop: make it anew")
             for i, row in zip(chosen, outputs.tolist(), strict=True):
-                kind = regions[i].kind
-                own = row[network.preset.output_slice(network.kinds, kind)]
-                primitives[i] = decode_parameters(kind, own, network.preset, regions[i].box, regions[i].tile)
+                own = row[network.preset.output_slice(network.kinds, regions[i].kind)]
+                primitives[i] = _decode(regions[i], own, network.preset)
         return [primitives[i] for i in range(len(regions))]
+
+
+def _decode(region: ClassifiedRegion, outputs: Sequence[float], preset: Preset) -> Primitive | None:
+    """Return the primitive that outputs encode; None where it is larger than its tile, or far from it."""
+    if max(map(abs, outputs)) > MAX_OUTPUT:
+        return None
+    tile = region.tile
+    primitive = decode_parameters(region.kind, outputs, preset, region.box, tile)
+    x, y = (tile.col + tile.cols / 2) * tile.resolution, (tile.row + tile.rows / 2) * tile.resolution
+    side = max(tile.rows, tile.cols) * tile.resolution
+    fits = primitive.bounding_radius <= side and math.hypot(primitive.x - x, primitive.y - y) <= 2 * side
+    return primitive if fits else None
 
 
 class _Network:
@@ -74,21 +94,19 @@ class _Network:
 
     def __init__(self, weights: Weights) -> None:
         self.weights = weights
-        if weights.card.preset not in PRESETS:
-            raise WeightsError(f"{weights.path} has a card with an unknown preset {weights.card.preset!r}")
-        self.preset: Preset = PRESETS[weights.card.preset]
+        self.preset: Preset = PRESETS[str(weights.card.preset)]
         self.kinds = [Kind(kind) for kind in weights.card.kinds]
-        self._input = weights.session.get_inputs()[0].name
-        outputs = self.run(np.zeros((1, self.preset.pixels, self.preset.pixels), np.uint8)).shape[-1]
-        expected = sum(self.preset.output_count(kind) for kind in self.kinds)
-        if outputs != expected:
-            raise WeightsError(f"{weights.path} gives {outputs} numbers where its card says {expected}")
+        self.run(np.zeros((1, self.preset.pixels, self.preset.pixels), np.uint8))
 
     def run(self, crops: NDArray[np.uint8]) -> NDArray[np.float32]:
         """Return outputs (N, M) of crops (N, pixels, pixels)."""
-        scaled = crops.astype(np.float32)[:, None] / np.float32(255)
-        images = np.repeat(scaled, self.weights.card.channels, axis=1)
-        try:
-            return np.asarray(self.weights.session.run(None, {self._input: images})[0], dtype=np.float32)
-        except Exception as error:  # ONNX Runtime raises undocumented exceptions of many types
-            raise WeightsError(f"{self.weights.path} does not take crops as its card says") from error
+        found = []
+        for first in range(0, len(crops), BATCHES["cnn"]):
+            scaled = crops[first : first + BATCHES["cnn"]].astype(np.float32)[:, None] / np.float32(255)
+            found.append(self.weights.run(np.repeat(scaled, self.weights.card.channels, axis=1)))
+        outputs = np.concatenate(found)
+        expected = len(crops), sum(self.preset.output_count(kind) for kind in self.kinds)
+        if outputs.shape != expected:
+            shape, wanted = (" x ".join(map(str, sizes)) for sizes in (outputs.shape, expected))
+            raise WeightsError(f"{self.weights.path} gives {shape} numbers where its card says {wanted}")
+        return outputs

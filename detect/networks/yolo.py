@@ -14,13 +14,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from detect.networks.tiles import TILE_SIZE, BoxArray
-from detect.networks.weights import Weights, WeightsError
+from detect.networks.weights import BATCHES, Weights, WeightsError
 from prim.shapes import Kind
 
 KINDS = tuple(Kind)
 """The kind of each class index, in labels, candidates and ground truth."""
 
-CHANNELS = 3
+MAX_REACH = 512
+"""Boxes that reach farther (cells) beyond their tile are dropped: what the head can say ends at 15 times its largest
+stride of 32 cells."""
+
+MAX_LOCATIONS = sum((TILE_SIZE // stride) ** 2 for stride in (4, 8, 16, 32))
+"""Largest number of locations that a detector may have: those of a head with all strides from 4 to 32."""
 
 
 @dataclass(frozen=True)
@@ -78,12 +83,8 @@ class Yolo:
             WeightsError: The network does not take tiles, or does not give boxes of the kinds of its card.
         """
         self.weights = weights
-        self._input = weights.session.get_inputs()[0].name
-        shape = self._run(np.zeros((1, CHANNELS, TILE_SIZE, TILE_SIZE), np.float32)).shape
         self._kinds = np.array([KINDS.index(Kind(name)) for name in weights.card.kinds], np.intp)
-        if len(shape) != 3 or shape[1] != 4 + len(self._kinds):
-            expected = f"boxes of {len(self._kinds)} kinds"
-            raise WeightsError(f"{weights.path} gives {shape}, not {expected}: it is no detector")
+        self._run(np.zeros(weights.card.input_shape(1), np.float32))
 
     def __call__(self, images: NDArray[np.uint8], score_floor: float, multi_label: bool = False) -> list[Boxes]:
         """Return the candidates of a batch of images, before non-maximum suppression.
@@ -98,23 +99,36 @@ class Yolo:
             The candidates of each image.
 
         Raises:
-            WeightsError: The network does not take the images.
+            WeightsError: The network does not take the images, or gives outputs that are not finite, or scores above
+                1.
         """
         scaled = np.ascontiguousarray(images.transpose(0, 3, 1, 2), dtype=np.float32) / np.float32(255)
-        return [_decode_output(output, self._kinds, score_floor, multi_label) for output in self._run(scaled)]
+        return [
+            _decode_output(output, self._kinds, score_floor, multi_label)
+            for first in range(0, len(scaled), BATCHES["yolo"])
+            for output in self._run(scaled[first : first + BATCHES["yolo"]])
+        ]
 
     def _run(self, images: NDArray[np.float32]) -> NDArray[np.float32]:
-        try:
-            return np.asarray(self.weights.session.run(None, {self._input: images})[0], dtype=np.float32)
-        except Exception as error:  # ONNX Runtime raises undocumented exceptions of many types
-            expected = f"images of {CHANNELS} x {TILE_SIZE} x {TILE_SIZE}"
-            raise WeightsError(f"{self.weights.path} does not take {expected}: it is no detector") from error
+        """Return outputs (N, 4 + K, locations) of images that are not too many."""
+        outputs = self.weights.run(images)
+        expected = (len(images), 4 + len(self._kinds))
+        if outputs.ndim != 3 or outputs.shape[:2] != expected or not 1 <= outputs.shape[2] <= MAX_LOCATIONS:
+            what = f"boxes of {len(self._kinds)} kinds"
+            raise WeightsError(f"{self.weights.path} gives {outputs.shape}, not {what}: it is no detector")
+        if outputs[:, 4:].max() > 1:
+            raise WeightsError(f"{self.weights.path} gives scores above 1: it is no detector")
+        return outputs
 
 
 def _decode_output(
     output: NDArray[np.float32], kinds: NDArray[np.intp], score_floor: float, multi_label: bool
 ) -> Boxes:
-    """Return candidates of one image from output (4 + K, N): centre, size, scores of the K ``kinds``."""
+    """Return candidates of one image from output (4 + K, N): centre, size, scores of the K ``kinds``.
+
+    Boxes that do not meet the tile, or reach far beyond it, bound nothing, and are left out.
+    """
+    output = output[:, _is_possible(output[:4])]
     scores = output[4:]
     if multi_label:
         kind, location = np.nonzero(scores >= score_floor)
@@ -125,6 +139,15 @@ def _decode_output(
     score = scores[kind, location]
     centre, half = output[0:2, location].T, output[2:4, location].T / 2
     return Boxes(np.concatenate((centre - half, centre + half), axis=1), kinds[kind], score)
+
+
+def _is_possible(boxes: NDArray[np.float32]) -> NDArray[np.bool_]:
+    """Return which boxes (4, N), centre and size, meet their tile and do not reach far beyond it."""
+    size, reach = boxes[2:], TILE_SIZE + 2 * MAX_REACH
+    half = np.clip(size, 0, reach) / 2
+    low, high = np.clip(boxes[:2], -reach, reach) - half, np.clip(boxes[:2], -reach, reach) + half
+    inside = (low < TILE_SIZE) & (high > 0) & (low >= -MAX_REACH) & (high <= TILE_SIZE + MAX_REACH)
+    return np.asarray((inside & (size > 0)).all(axis=0), dtype=np.bool_)
 
 
 def box_iou(box: BoxArray, others: BoxArray) -> NDArray[np.float32]:

@@ -10,7 +10,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from detect.networks.onnx_file import Network, Node, Port, write_network
 from detect.networks.weights import KIND_NAMES, ModelCard, WeightsError, load_weight_set, load_weights
+from prim.text import printable
 
 
 @pytest.mark.parametrize(
@@ -89,14 +91,11 @@ def test_an_exported_network_has_torchs_outputs(tmp_path: Path, preset: str, kin
 
 def write_identity(path: Path, card: ModelCard | str) -> None:
     """Write the identity as a network with a model card, or with any text in its place."""
-    onnx = pytest.importorskip("onnx", reason="needs the extra [train]")
-    from onnx import TensorProto, helper
-
-    ends = [helper.make_tensor_value_info(name, TensorProto.FLOAT, ["n"]) for name in ("a", "b")]
-    graph = helper.make_graph([helper.make_node("Identity", ["a"], ["b"])], "tiny", ends[:1], ends[1:])
-    model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=8)
-    model.metadata_props.add(key="prim", value=card if isinstance(card, str) else card.to_json())
-    onnx.save(model, str(path))
+    ends = [Port(name, np.dtype(np.float32), ("n", "channels", "rows", "cols")) for name in ("a", "b")]
+    text = card if isinstance(card, str) else card.to_json()
+    path.write_bytes(
+        write_network(Network(8, 17, (Node("Identity", ("a",), ("b",), {}),), {}, *ends, {"prim": text}))
+    )
 
 
 YOLO, CNN = ModelCard("yolo", "det"), ModelCard("cnn", "det", preset="prim", channels=1)
@@ -133,22 +132,57 @@ def test_folders_of_inconsistent_weights_are_refused(tmp_path: Path, others: lis
 @pytest.mark.parametrize(
     "change",
     [
-        {"stage": "magic"},
-        {"kinds": [["square"]]},
-        {"kinds": ["hexagon"]},
-        {"style": "loud"},
-        {"channels": "a"},
-        {"resolution": "x"},
-        {"resolution": 0.0},
-        {"thresholds": [1]},
-        {"thresholds": {"square": 7.0}},
-        {"mapper": 3},
+        {"stage": "magic"}, {"stage": None}, {"stage": ["yolo"]}, {"stage": {}},
+        {"kinds": [["square"]]}, {"kinds": ["hexagon"]}, {"kinds": "square"}, {"kinds": []}, {"kinds": None},
+        {"kinds": {"square": 1}}, {"kinds": ["square", "square"]}, {"kinds": [1]},
+        {"style": "loud"}, {"style": 1}, {"style": None},
+        {"channels": "a"}, {"channels": True}, {"channels": 3.0}, {"channels": 2}, {"channels": 10**40},
+        {"resolution": "x"}, {"resolution": 0.0}, {"resolution": 1e-300}, {"resolution": 1e300},
+        {"resolution": -0.01},
+        {"resolution": True}, {"resolution": float("nan")}, {"resolution": float("inf")}, {"resolution": 10**400},
+        {"thresholds": [1]}, {"thresholds": {"square": 7.0}}, {"thresholds": {"square": float("nan")}},
+        {"thresholds": {"square": None}}, {"thresholds": {"hexagon": 0.5}}, {"thresholds": None},
+        {"mapper": 3}, {"mapper": "magic"}, {"mapper": "\x1b]0;x\x07"}, {"mapper": "a\nb" * 9999},
+        {"preset": "prim"}, {"preset": 1}, {"preset": {}},
+        {"about": []}, {"about": None}, {"\x1b[31m": 1}, {"magic" * 9999: 1},
     ],
-)
+)  # fmt: skip
 def test_impossible_model_cards_are_refused(tmp_path: Path, change: dict[str, object]) -> None:
     write_identity(tmp_path / "a.onnx", json.dumps(json.loads(YOLO.to_json()) | change))
-    with pytest.raises(WeightsError, match="has no model card"):
-        load_weights(tmp_path / "a.onnx", "yolo")
+    assert_no_card(tmp_path / "a.onnx", "yolo")
+
+
+@pytest.mark.parametrize("preset", ["magic", None, 1, [], True])
+def test_a_parameter_network_without_a_known_preset_is_refused(tmp_path: Path, preset: object) -> None:
+    write_identity(tmp_path / "a.onnx", json.dumps(json.loads(CNN.to_json()) | {"preset": preset}))
+    assert_no_card(tmp_path / "a.onnx", "cnn")
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "", "x", "null", "[]", "[" * 100_000, '{"schema": "prim-weights/1", "about": ' + '{"a": ' * 100_000,
+        '{"schema": ' + "1" * 5000 + "}", "\x00", '{"schema": "prim-weights/1"}',
+    ],
+)  # fmt: skip
+def test_texts_that_are_no_model_card_are_refused(tmp_path: Path, text: str) -> None:
+    write_identity(tmp_path / "a.onnx", text)
+    assert_no_card(tmp_path / "a.onnx", "yolo")
+
+
+def assert_no_card(path: Path, stage: str) -> None:
+    """A network is refused for its card, in one line of printable text that is not long."""
+    with pytest.raises(WeightsError, match="has no model card") as caught:
+        load_weights(path, stage)
+    assert str(caught.value) == printable(str(caught.value)) and len(str(caught.value)) < 500
+
+
+def test_what_a_card_tells_of_its_training_may_be_nested(tmp_path: Path) -> None:
+    about: dict[str, object] = {}
+    for _ in range(100):
+        about = {"a": about, "n": 1e300}
+    write_identity(tmp_path / "a.onnx", replace(YOLO, about=about))
+    assert load_weights(tmp_path / "a.onnx", "yolo").card.about == about
 
 
 def test_files_without_a_checkpoint_are_not_exported(tmp_path: Path) -> None:
