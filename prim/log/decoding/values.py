@@ -87,5 +87,5 @@ def quaternion(heading: float) -> tuple[float, float, float, float]:
 def checked_stamp(stamp: int) -> int:
     """Return a stamp (ns) that fits into 64 bits, and leaves room to compute with. Raises ValueError."""
     if abs(stamp) >= 1 << 62:
-        raise ValueError(f"its stamp, {stamp / 1e9:g} s, is beyond all times")
+        raise ValueError("its stamp is beyond all times (2^62 ns)")
     return stamp
