@@ -359,7 +359,7 @@ class CarmenReader(LogReader):
         if not self._recover:
             raise LogReadError(self.path, f"damaged: it has {what}", RECOVER_HINT)
         self._is_cut = True
-        self.lost += [what] * (what not in self.lost)
+        self._lose(what)
 
     def _codec(self, topic: Topic) -> Codec:
         if topic.content is Content.SCAN:

@@ -17,6 +17,9 @@ from prim.log.log_file import ZSTD_MAGIC, LogFile
 from prim.log.source import Message, Numbered, Topic
 from prim.log.time_resets import LATEST, as_stamps
 
+MAX_LOST = 100
+"""So many losses are listed one by one."""
+
 MIN_WINDOW = 1 << 23
 """All frames of zstd that refer back no farther (bytes) are read (RFC 8878, 3.1.1.1.2, recommends that)."""
 
@@ -129,6 +132,13 @@ class LogReader(ABC):
                     self._reject(name, number, final)
                     continue
             yield number, name, log_time, value
+
+    def _lose(self, what: str) -> None:
+        """Add a line to :attr:`lost`, once; of very many, the first."""
+        if len(self.lost) < MAX_LOST and what not in self.lost:
+            self.lost.append(what)
+            if len(self.lost) == MAX_LOST:
+                self.lost.append("and more")
 
     def _reject(self, topic: str, number: int, error: ValueError) -> None:
         """Count a message that cannot be decoded as lost; unless recovering, raise LogReadError."""

@@ -165,8 +165,7 @@ class SqliteBagReader(LogReader):
                 limit = -1  # the last row before the damage was read by itself
             except sqlite3.DatabaseError as error:
                 self._is_cut = True
-                what = f"messages in damaged pages of the database: {error}"
-                self.lost += [what] * (what not in self.lost)
+                self._lose(f"messages in damaged pages of the database: {error}")
                 at, step, limit = at + step, 2 * step + 1, 1
 
 
