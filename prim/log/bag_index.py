@@ -10,6 +10,7 @@ from typing import NamedTuple
 import numpy as np
 
 from prim.log.bag_records import MAGIC, BagRecords, Op, Record, fields_of
+from prim.log.decoding.cdr import SECOND
 
 _COUNT = struct.Struct("<II")
 """Of a chunk's messages of a connection: its number, and how many."""
