@@ -20,6 +20,9 @@ from prim.log.time_resets import LATEST, as_stamps
 MAX_LOST = 100
 """So many losses are listed one by one."""
 
+MAX_REASON = 300
+"""Of the reason why a message cannot be decoded, so many characters are shown."""
+
 MIN_WINDOW = 1 << 23
 """All frames of zstd that refer back no farther (bytes) are read (RFC 8878, 3.1.1.1.2, recommends that)."""
 
@@ -142,11 +145,12 @@ class LogReader(ABC):
 
     def _reject(self, topic: str, number: int, error: ValueError) -> None:
         """Count a message that cannot be decoded as lost; unless recovering, raise LogReadError."""
+        reason = str(error)[:MAX_REASON]
         if not self._recover:
-            what = f"message {number} of {topic} cannot be decoded: {error}"
+            what = f"message {number} of {topic} cannot be decoded: {reason}"
             raise LogReadError(self.path, what, "pass over such messages with --recover")
         if not any(name == topic for name, _ in self._undecodable):
-            self.lost.append(f"messages of {topic} that cannot be decoded, the first one {number}: {error}")
+            self.lost.append(f"messages of {topic} that cannot be decoded, the first one {number}: {reason}")
         self._undecodable.add((topic, number))
 
 

@@ -35,7 +35,7 @@ MAX_STEP = 1 << 40
 """Behind damage, messages are searched for this far on (rows)."""
 
 MAX_ROW = 1 << 62
-"""Rows are numbered no higher, unless they are damaged."""
+"""Rows are numbered no higher, unless they are damaged, and times (ns) are no later."""
 
 CHECKED = (1 << 31) - 1
 """Sums that are compared are of numbers modulo this one: they fit into 64 bits."""
@@ -202,7 +202,7 @@ class SqliteBagReader(LogReader):
         for row, number, time, kind in self._rows("topic_id, timestamp, typeof(data)"):
             if not isinstance(number, int) or number not in self._numbers:
                 self._damage("messages of a topic that is not listed")
-            elif not isinstance(time, int) or kind not in ("blob", "null"):
+            elif not isinstance(time, int) or abs(time) > MAX_ROW or kind not in ("blob", "null"):
                 self._damage("messages whose time is no number, or whose data are no bytes")
             else:
                 table.add(row, number, time)

@@ -9,6 +9,9 @@ from prim.arrays import FloatArray
 from prim.se2 import Pose2D
 from prim.shapes import Primitive
 
+MAX_POINTS = 1 << 22
+"""A cloud has no more points: each takes 24 bytes, whatever the message has of it; set by hand."""
+
 
 class StampedPose(NamedTuple):
     """A pose as messages hold it.
@@ -82,6 +85,13 @@ def planar_pose(pose: StampedPose) -> Pose2D:
 def quaternion(heading: float) -> tuple[float, float, float, float]:
     """Return the quaternion x, y, z, w of a turn about the z axis (rad)."""
     return 0.0, 0.0, math.sin(heading / 2), math.cos(heading / 2)
+
+
+def checked_count(points: int) -> int:
+    """Return a number of points that a cloud may have. Raises ValueError."""
+    if points > MAX_POINTS:
+        raise ValueError(f"a cloud of {points} points, more than {MAX_POINTS}")
+    return points
 
 
 def checked_stamp(stamp: int) -> int:
