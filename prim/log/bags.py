@@ -89,7 +89,10 @@ class BagReader(LogReader):
     def __init__(self, file: LogFile, recover: bool) -> None:
         super().__init__(file.path, recover, file)
         self._unpack_hint = file.unpack_hint
-        self._stream = file.data.open("rb")
+        try:
+            self._stream = file.data.open("rb")
+        except OSError as error:
+            raise LogReadError(file.path, f"cannot be read: {error.strerror or error}") from error
         self._unpacked: IO[bytes] | None = None
         self._unpacked_bytes = self._records_read = 0
         self._table = _Table()
