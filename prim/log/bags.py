@@ -35,6 +35,9 @@ from prim.log.time_resets import as_stamps, find_shifts, moved_behind_resets, re
 
 ENCODING = "ros1"
 
+COSTS = {b"none": 0, b"lz4": 1, b"bz2": 8}
+"""What unpacking takes, by the compression: of what all chunks may unpack to, a byte of bzip2 uses up so many."""
+
 
 class _Table:
     """Where all messages are, in the order in which they were written: 24 bytes each."""
@@ -206,10 +209,11 @@ class BagReader(LogReader):
         if compression != b"none" and size > limit:
             raise ValueError(f"a chunk of {len(record.data)} bytes that claims {size}, more than {limit}")
         data, problem = unpacked(compression, record.data, size)
-        if compression != b"none":
-            self._unpacked_bytes += len(data)
+        if cost := COSTS[compression]:
+            self._unpacked_bytes += cost * len(data)
             if self._unpacked_bytes > unpacked_limit(self.file_bytes):
-                what = f"its {self.file_bytes} bytes unpack to more than {unpacked_limit(self.file_bytes)} bytes"
+                largest = unpacked_limit(self.file_bytes) // cost
+                what = f"its {self.file_bytes} bytes unpack to more than {largest} bytes"
                 hint = f"if you trust it, unpack its chunks with: rosbag decompress {shlex.quote(str(self.path))}"
                 raise LogReadError(self.path, what, self._unpack_hint or hint)
         return data, problem

@@ -13,7 +13,7 @@ UNPACKED_GROWTH = 256
 that stands still without noise about 100 times. DEFLATE's bound is 1032, that of zstd 2^15. What is unpacked costs
 time and disk, so that the whole of it has a limit too; at 1 GB/s this one takes 0.3 s for each packed MB."""
 
-RECORDS_BASE, BYTES_A_RECORD = 100_000, 8
+RECORDS_BASE, BYTES_A_RECORD = 50_000, 16
 """A log has no more records (messages, lines, rows) than the former and one for each so many bytes of its file. One
 that is not compressed cannot exceed that, since a record takes more; one that is needs its time and data."""
 

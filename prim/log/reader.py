@@ -129,8 +129,11 @@ class LogReader(ABC):
             try:
                 value = decode(data)
             except ValueError as error:
+                if not data.startswith(ZSTD_MAGIC):
+                    self._reject(name, number, error)
+                    continue
                 try:
-                    value = decode(decompressor.decompressed(data, error))
+                    value = decode(decompressor.decompressed(data))
                 except ValueError as final:
                     self._reject(name, number, final)
                     continue
@@ -165,21 +168,8 @@ class _Decompressor:
         self._largest = memory_limit(file_bytes)
         self._left = unpacked_limit(file_bytes)
 
-    def decompressed(self, data: bytes, error: ValueError) -> bytes:
-        """Decompress a message that could not be decoded as it is.
-
-        Args:
-            data: The message.
-            error: Is raised where it is no frame of zstd.
-
-        Returns:
-            What it was before it was compressed.
-
-        Raises:
-            ValueError: It is not compressed, or damaged, or too large.
-        """
-        if not data.startswith(ZSTD_MAGIC):
-            raise error
+    def decompressed(self, data: bytes) -> bytes:
+        """Decompress a message that could not be decoded as it is. Raises ValueError."""
         largest = min(self._largest, self._left)
         try:
             claimed = zstandard.frame_content_size(data)

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from prim.arrays import Stamps
 from prim.errors import LogReadError
 from prim.log.decoding.codecs import SCAN_CONTENTS, content_of
-from prim.log.limits import memory_limit, records_limit
+from prim.log.limits import memory_limit, records_limit, unpacked_limit
 from prim.log.log_file import LogFile
 from prim.log.reader import LogReader
 from prim.log.recovery import RECOVER_HINT
@@ -93,6 +93,7 @@ class SqliteBagReader(LogReader):
         super().__init__(file.path, recover, file)
         self._folder: tempfile.TemporaryDirectory[str] | None = None
         self._is_cut = False
+        self._unpack_hint = file.unpack_hint
         self._data_bytes = file.data.stat().st_size
         self._steps = 0
         self._numbers: dict[int, str] = {}
@@ -188,17 +189,20 @@ class SqliteBagReader(LogReader):
 
     def _check_sizes(self) -> None:
         """Raise LogReadError where rows claim more than the file has: several may share pages of a damaged one."""
-        if self._recover:
-            return
         query = "SELECT SUM(CASE typeof(data) WHEN 'blob' THEN LENGTH(data) END) FROM messages NOT INDEXED"
-        ((claimed,),) = self._query(query)
+        try:
+            ((claimed,),) = self._query(query)
+        except sqlite3.DatabaseError:
+            if not self._recover:
+                raise
+            return
         if (claimed or 0) > self._data_bytes:
             self._damage(f"its messages claim {claimed} bytes of {self._data_bytes}")
 
     def _read_rows(self) -> _Table:
         """Read which messages there are."""
         table = _Table()
-        limit = records_limit(self._data_bytes)
+        limit = records_limit(self.file_bytes)
         for row, number, time, kind in self._rows("topic_id, timestamp, typeof(data)"):
             if not isinstance(number, int) or number not in self._numbers:
                 self._damage("messages of a topic that is not listed")
@@ -207,7 +211,9 @@ class SqliteBagReader(LogReader):
             else:
                 table.add(row, number, time)
             if len(table) > limit:
-                raise LogReadError(self.path, f"more than {limit} messages in {self._data_bytes} bytes")
+                raise LogReadError(
+                    self.path, f"more than {limit} messages in {self.file_bytes} bytes", self._unpack_hint
+                )
         return table
 
     def _check_index(self) -> None:
@@ -270,6 +276,7 @@ class SqliteBagReader(LogReader):
 
     def _stored_messages(self, selected: NDArray[np.int64]) -> Iterator[Message]:
         """Yield the messages of these rows, one by one."""
+        left = unpacked_limit(self._data_bytes)
         rows, topics, times = self._table.rows, self._table.topics, self._table.times
         for k in selected.tolist():
             with self._translated_errors(RECOVER_HINT):
@@ -280,7 +287,12 @@ class SqliteBagReader(LogReader):
                         raise
                     self._damage(f"messages in damaged pages of the database: {error}")
                     continue
-            yield Message(self._numbers[int(topics[k])], int(times[k]), (found[0] if found else None) or b"")
+            data = (found[0] if found else None) or b""
+            left -= len(data)
+            if left < 0:
+                what = f"its messages claim more than the {self._data_bytes} bytes that there are"
+                raise LogReadError(self.path, f"damaged: {what}")
+            yield Message(self._numbers[int(topics[k])], int(times[k]), data)
 
     def _rows(self, columns: str) -> Iterator[tuple[Any, ...]]:
         """Yield rowid and columns of all messages as written, past what is damaged where that is to be recovered."""
