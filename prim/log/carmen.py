@@ -319,7 +319,8 @@ class CarmenReader(LogReader):
     def _lines(self) -> Iterator[_Line]:
         """Yield the lines that are no comments. Raises LogReadError where they are damaged, or too many."""
         count, limit = 0, records_limit(self.file_bytes)
-        for lines in self._blocks():
+        sizes: dict[str, int] = {}
+        for lines, is_ended in self._blocks():
             count += len(lines)
             if count > limit:
                 hint = self._file_of_log.unpack_hint if self._file_of_log else ""
@@ -331,11 +332,14 @@ class CarmenReader(LogReader):
                     continue
                 if "\0" in text:
                     self._damage("lines with bytes that are no text")
-                    continue
-                yield _Line(name, fields)
+                elif not is_ended and len(fields) < sizes.get(name, 0):
+                    self._damage("a last line that is cut")
+                else:
+                    sizes[name] = len(fields)
+                    yield _Line(name, fields)
 
-    def _blocks(self) -> Iterator[list[bytes]]:
-        """Yield the file in lists of lines; those that are too long are left out."""
+    def _blocks(self) -> Iterator[tuple[list[bytes], bool]]:
+        """Yield the file in lists of lines, and whether these are ended; lines that are too long are left out."""
         at, rest, is_cut = 0, b"", False
         while True:
             self._file.seek(at)  # several readers may be at work
@@ -349,9 +353,9 @@ class CarmenReader(LogReader):
             if is_cut or len(rest) > LINE_LIMIT:
                 self._damage(f"lines of more than {LINE_LIMIT} bytes")
                 rest, is_cut = b"", True
-            yield lines
+            yield lines, True
             if not block:
-                yield [rest]
+                yield [rest], False
                 return
 
     def _damage(self, what: str) -> None:
@@ -383,11 +387,16 @@ class CarmenReader(LogReader):
     def _decode_scan(self, data: bytes) -> Scan:
         time, line = self._split(data)
         scan = _laser_line(line)
-        ranges = np.array(scan.readings, dtype=np.float32)
         longest = scan.max_range or self._max_range.get(line.name, DEFAULT_MAX_RANGE)
         stamp = _nanoseconds(scan.stamp) if time is None else time
-        first, increment, limit = (float(np.float32(value)) for value in (scan.angle_min, scan.increment, longest))
-        return Scan(stamp, line.name.lower(), first, increment, 0.0, limit, ranges)  # in a LaserScan's precision
+        with np.errstate(over="ignore"):  # what is beyond single precision is infinite
+            ranges = np.array(scan.readings, dtype=np.float32)
+            first, increment, limit = (
+                float(np.float32(value)) for value in (scan.angle_min, scan.increment, longest)
+            )
+        return Scan(
+            stamp, line.name.lower(), limits[0], limits[1], 0.0, limits[2], ranges
+        )  # in a LaserScan's precision
 
     def _decode_pose(self, data: bytes, reads_laser: bool) -> StampedPose:
         time, line = self._split(data)
