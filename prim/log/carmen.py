@@ -391,12 +391,8 @@ class CarmenReader(LogReader):
         stamp = _nanoseconds(scan.stamp) if time is None else time
         with np.errstate(over="ignore"):  # what is beyond single precision is infinite
             ranges = np.array(scan.readings, dtype=np.float32)
-            first, increment, limit = (
-                float(np.float32(value)) for value in (scan.angle_min, scan.increment, longest)
-            )
-        return Scan(
-            stamp, line.name.lower(), limits[0], limits[1], 0.0, limits[2], ranges
-        )  # in a LaserScan's precision
+            first, increment, limit = map(_rounded, (scan.angle_min, scan.increment, longest))
+        return Scan(stamp, line.name.lower(), first, increment, 0.0, limit, ranges)
 
     def _decode_pose(self, data: bytes, reads_laser: bool) -> StampedPose:
         time, line = self._split(data)
@@ -408,6 +404,8 @@ class CarmenReader(LogReader):
             if found is None:
                 raise ValueError("a line without poses")
             pose = found
+        if math.isinf(pose.theta):
+            raise ValueError("its heading is infinite")
         child = line.name.lower() if reads_laser else BASE_FRAME
         return _stamped(_nanoseconds(text) if time is None else time, ODOM_FRAME, child, pose)
 
@@ -485,6 +483,11 @@ def _logged(line: _Line) -> int:
         return _nanoseconds(line.fields[-1])
     except (ValueError, IndexError):
         return 0
+
+
+def _rounded(value: float) -> float:
+    """Return a number in the precision that a LaserScan has."""
+    return float(np.float32(value))
 
 
 def _is_number(text: str) -> bool:
