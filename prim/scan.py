@@ -42,6 +42,9 @@ class RangeOutcome(IntEnum):
     INVALID = 3
 
 
+MAX_BEAMS = 1 << 20
+"""No scanner takes more beams in a sweep: finer ones than every 1.2 arc seconds; set by hand."""
+
 MAX_TIME_INCREMENT = 1e3
 """A longer time from beam to beam (s) is none; set by hand."""
 
@@ -96,6 +99,8 @@ class Scan:
     @property
     def problem(self) -> str | None:
         """What makes the whole scan unusable; None where nothing does."""
+        if len(self.ranges) > MAX_BEAMS:
+            return f"{len(self.ranges)} beams, more than {MAX_BEAMS}"
         if not (
             math.isfinite(self.angle_min) and math.isfinite(self.angle_increment) and math.isfinite(self.range_min)
         ):

@@ -103,9 +103,9 @@ def _open_mcap(file: LogFile, recover: bool) -> LogReader:
 
 
 def _open_bag(file: LogFile, recover: bool) -> LogReader:
-    from prim.log.bags import RecoveredBagReader, Ros1BagReader
+    from prim.log.bags import BagReader
 
-    return RecoveredBagReader(file) if recover else Ros1BagReader(file)
+    return BagReader(file, recover)
 
 
 def _open_sqlite(file: LogFile, recover: bool) -> LogReader:

@@ -11,7 +11,7 @@ import re
 from collections import Counter
 from collections.abc import Iterator
 from contextlib import suppress
-from typing import NamedTuple
+from typing import NamedTuple, TypeGuard
 
 import numpy as np
 
@@ -19,11 +19,14 @@ from prim.errors import LogReadError
 from prim.log.decoding.cdr import SECOND
 from prim.log.decoding.codecs import Codec, Content
 from prim.log.decoding.values import StampedPose, checked_stamp, quaternion
+from prim.log.limits import records_limit
 from prim.log.log_file import LogFile
 from prim.log.reader import LogReader
+from prim.log.recovery import RECOVER_HINT
 from prim.log.source import Message, Topic
 from prim.scan import Scan
 from prim.se2 import Pose2D, wrap_angle
+from prim.strict_json import SHOWN
 
 BYTE_ORDER_MARK = b"\xef\xbb\xbf"
 """How a text begins that an editor saved as UTF-8."""
@@ -69,6 +72,15 @@ REPEATED_SHARE = 0.9
 
 COARSE_SHARE = 0.5
 """Where fewer than this share of the scans have a time of their own, times are too coarse to be used."""
+
+LINE_LIMIT = 1 << 22
+"""Lines are no longer (bytes): a scan of 2^19 readings is not. Taken apart, one takes 30 times as much memory."""
+
+BLOCK_BYTES = 1 << 20
+"""So much is read at once."""
+
+FAR = 1e9
+"""Poses beyond it (m, rad) tell nothing of the laser's place on the robot."""
 
 SPACING = SECOND // 10
 """The time from one scan to the next (ns) that stands in for times that are too coarse."""
@@ -179,7 +191,7 @@ class CarmenReader(LogReader):
         self._mounts: dict[str, _Mount] = {}
         self._repeated: Counter[str] = Counter()
         self._first_time = 0
-        self._even_times = False
+        self._even_times = self._is_cut = False
         try:
             self._survey()
         except BaseException:
@@ -190,6 +202,11 @@ class CarmenReader(LogReader):
     def close(self) -> None:
         """Close the file."""
         self._file.close()
+
+    @property
+    def messages_lost(self) -> int | None:
+        """The number of messages that could not be read; None where the log does not say how many there were."""
+        return None if self._is_cut else super().messages_lost
 
     def _survey(self) -> None:
         """Read all lines once: count them, and find the parameters, the mounts of the lasers, and usable times."""
@@ -232,7 +249,7 @@ class CarmenReader(LogReader):
             self._first_time = self._first_time or _nanoseconds(scan.stamp)
         except ValueError:
             return ""  # an error, or a loss, when it is decoded
-        if scan.laser_pose is not None and scan.robot_pose is not None:
+        if _is_near(scan.laser_pose) and _is_near(scan.robot_pose):
             self._mounts.setdefault(line.name, _Mount()).add(scan.robot_pose.inverse() @ scan.laser_pose)
             motion.add(scan.robot_pose)
         return scan.stamp
@@ -300,20 +317,53 @@ class CarmenReader(LogReader):
         return [line.name, *((ROBOT_POSES, CORRECTED_POSES) if with_poses else ())]
 
     def _lines(self) -> Iterator[_Line]:
-        """Yield the lines that are no comments."""
-        self._file.seek(0)
-        at = 0
-        while True:
-            self._file.seek(at)  # several readers may be at work
-            lines = self._file.readlines(1 << 20)
-            at = self._file.tell()
-            if not lines:
-                return
+        """Yield the lines that are no comments. Raises LogReadError where they are damaged, or too many."""
+        count, limit = 0, records_limit(self.file_bytes)
+        sizes: dict[str, int] = {}
+        for lines, is_ended in self._blocks():
+            count += len(lines)
+            if count > limit:
+                hint = self._file_of_log.unpack_hint if self._file_of_log else ""
+                raise LogReadError(self.path, f"more than {limit} lines in {self.file_bytes} bytes", hint)
             for line in lines:
                 text = line.removeprefix(BYTE_ORDER_MARK).decode("utf-8", "replace")
                 name, *fields = text.split() or ["#"]
-                if not name.startswith("#"):
+                if name.startswith("#"):
+                    continue
+                if "\0" in text:
+                    self._damage("lines with bytes that are no text")
+                elif not is_ended and len(fields) < sizes.get(name, 0):
+                    self._damage("a last line that is cut")
+                else:
+                    sizes[name] = len(fields)
                     yield _Line(name, fields)
+
+    def _blocks(self) -> Iterator[tuple[list[bytes], bool]]:
+        """Yield the file in lists of lines, and whether these are ended; lines that are too long are left out."""
+        at, rest, is_cut = 0, b"", False
+        while True:
+            self._file.seek(at)  # several readers may be at work
+            block = self._file.read(BLOCK_BYTES)
+            at += len(block)
+            lines = (rest + block).split(b"\n")
+            rest = lines.pop()
+            if is_cut and lines:  # the end of a line that was too long
+                del lines[0]
+                is_cut = False
+            if is_cut or len(rest) > LINE_LIMIT:
+                self._damage(f"lines of more than {LINE_LIMIT} bytes")
+                rest, is_cut = b"", True
+            yield lines, True
+            if not block:
+                yield [rest], False
+                return
+
+    def _damage(self, what: str) -> None:
+        """Note what is lost; unless recovering, raise LogReadError."""
+        if not self._recover:
+            raise LogReadError(self.path, f"damaged: it has {what}", RECOVER_HINT)
+        self._is_cut = True
+        self._lose(what)
 
     def _codec(self, topic: Topic) -> Codec:
         if topic.content is Content.SCAN:
@@ -337,11 +387,12 @@ class CarmenReader(LogReader):
     def _decode_scan(self, data: bytes) -> Scan:
         time, line = self._split(data)
         scan = _laser_line(line)
-        ranges = np.array(scan.readings, dtype=np.float32)
         longest = scan.max_range or self._max_range.get(line.name, DEFAULT_MAX_RANGE)
         stamp = _nanoseconds(scan.stamp) if time is None else time
-        first, increment, limit = (float(np.float32(value)) for value in (scan.angle_min, scan.increment, longest))
-        return Scan(stamp, line.name.lower(), first, increment, 0.0, limit, ranges)  # in a LaserScan's precision
+        with np.errstate(over="ignore"):  # what is beyond single precision is infinite
+            ranges = np.array(scan.readings, dtype=np.float32)
+            first, increment, limit = map(_rounded, (scan.angle_min, scan.increment, longest))
+        return Scan(stamp, line.name.lower(), first, increment, 0.0, limit, ranges)
 
     def _decode_pose(self, data: bytes, reads_laser: bool) -> StampedPose:
         time, line = self._split(data)
@@ -353,6 +404,8 @@ class CarmenReader(LogReader):
             if found is None:
                 raise ValueError("a line without poses")
             pose = found
+        if math.isinf(pose.theta):
+            raise ValueError("its heading is infinite")
         child = line.name.lower() if reads_laser else BASE_FRAME
         return _stamped(_nanoseconds(text) if time is None else time, ODOM_FRAME, child, pose)
 
@@ -416,6 +469,10 @@ def _pose(fields: list[str], at: int) -> Pose2D:
     return Pose2D(float(fields[at]), float(fields[at + 1]), float(fields[at + 2]))
 
 
+def _is_near(pose: Pose2D | None) -> TypeGuard[Pose2D]:
+    return pose is not None and all(abs(value) < FAR for value in (pose.x, pose.y, pose.theta))  # False for NaN
+
+
 def _stamped(stamp: int, parent: str, child: str, pose: Pose2D) -> StampedPose:
     return StampedPose(stamp, parent, child, (pose.x, pose.y, 0.0), quaternion(pose.theta))
 
@@ -426,6 +483,11 @@ def _logged(line: _Line) -> int:
         return _nanoseconds(line.fields[-1])
     except (ValueError, IndexError):
         return 0
+
+
+def _rounded(value: float) -> float:
+    """Return a number in the precision that a LaserScan has."""
+    return float(np.float32(value))
 
 
 def _is_number(text: str) -> bool:
@@ -440,7 +502,7 @@ def _nanoseconds(text: str) -> int:
     whole, _, decimals = text.partition(".")
     if whole.isdigit() and decimals.isdigit():
         return checked_stamp(int(whole) * SECOND + int(decimals[:9].ljust(9, "0")))
-    seconds = float(text)
-    if not math.isfinite(seconds):
-        raise ValueError(f"{text} is no time")
-    return checked_stamp(round(seconds * SECOND))
+    nanoseconds = float(text) * SECOND
+    if not math.isfinite(nanoseconds):
+        raise ValueError(f"{text[:SHOWN]} is no time")
+    return checked_stamp(round(nanoseconds))

@@ -19,13 +19,34 @@ from prim.log.decoding.codecs import SCAN_CONTENTS
 from prim.log.reader import LogReader
 from prim.log.source import Message, Topic
 from prim.log.time_resets import find_shifts, moved_behind_resets, reset_notes
-from prim.text import listed
 
 METADATA = "metadata.yaml"
 """The file in a ROS 2 bag's folder that lists the others."""
 
 COMPRESSED_SUFFIXES = (".zstd", ".zst", ".gz")
 """How the names of compressed files end."""
+
+METADATA_BYTES = 4 << 20
+"""METADATA is no longer (bytes): 300 for each file of a bag."""
+
+YAML_BYTES = 1 << 14
+"""So much of it is parsed as YAML at most (bytes), which takes 0.8 s; a plain list of files is read without."""
+
+MAX_FILES = 10_000
+"""A bag has no more files."""
+
+STRING_TAG = "tag:yaml.org,2002:str"
+"""What YAML calls text."""
+
+MAX_NAME = 255
+"""A file's name is no longer (bytes)."""
+
+SHOWN_NAMES = 20
+"""So many files are named where there are more."""
+
+_PATHS = re.compile(r"^ *relative_file_paths:[ \t]*\n((?: *- [^\n]*(?:\n|\Z))+)", re.MULTILINE)
+_PLAIN_NAME = re.compile(r""" *- (?:"([^"\\]*)"|'([^']*)'|(\w[\w.+ ()-]*[A-Za-z][\w.+ ()-]*))[ \t]*""")
+"""The list of files as rosbag2 writes it, and a file in it whose name needs no YAML to be read."""
 
 _LOG_NAME = re.compile(r"\.(mcap|db3|bag|bag\.active)(\.(zstd|zst|gz))?$")
 """How the names of logs in a folder end."""
@@ -43,19 +64,20 @@ def files_of_bag(folder: Path) -> list[Path]:
     Raises:
         LogReadError: The folder holds no log, or several that do not belong together.
     """
-    named = _listed_files(folder)
-    if any(file.exists() for file in named):
-        return named
+    listed = _distinct(_listed_files(folder))
+    if any(file.exists() for file in listed):
+        return listed
     by_stem = {_stem(path): path for path in sorted(folder.iterdir(), key=_preference, reverse=True) if _is_log(path)}
-    found = sorted(by_stem.values(), key=_part_number)
-    if not found and named:
-        return named
+    found = _distinct(sorted(by_stem.values(), key=_part_number))
+    if not found and listed:
+        return listed
     if not found:
         raise LogReadError(folder, "a folder without a log in it", "give a log, or the folder of a ROS 2 bag")
     if len(found) > 1 and len({_part_number(path)[0] for path in found}) > 1:
-        names = listed(path.name for path in found)
         raise LogReadError(
-            folder, f"a folder with {len(found)} logs ({names})", f"give one of them: {shlex.quote(str(found[0]))}"
+            folder,
+            f"a folder with {len(found)} logs ({_named(found)})",
+            f"give one of them: {shlex.quote(str(found[0]))}",
         )
     return found
 
@@ -69,7 +91,10 @@ def notes_on_part(path: Path) -> list[str]:
     Returns:
         The notes.
     """
-    names = [file.name for file in _listed_files(path.parent)]
+    try:
+        names = [file.name for file in _listed_files(path.parent)]
+    except LogReadError:  # of a list that this file does not need
+        return []
     if len(names) < 2 or path.name not in names:
         return []
     which = (
@@ -92,26 +117,74 @@ def notes_on_unlisted(folder: Path, files: Sequence[Path]) -> list[str]:
     read = {_stem(file) for file in files}
     bags = {_part_number(file)[0] for file in files}
     others = [path for path in folder.iterdir() if _is_log(path) and _stem(path) not in read]
-    names = [path.name for path in sorted(others, key=_part_number) if _part_number(path)[0] in bags]
-    return [f"{METADATA} does not list {', '.join(names)}: not read; without {METADATA}, all are"] if names else []
+    parts = [path for path in sorted(others, key=_part_number) if _part_number(path)[0] in bags]
+    return [f"{METADATA} does not list {_named(parts)}: not read; without {METADATA}, all are"] if parts else []
+
+
+def _named(files: Sequence[Path]) -> str:
+    """Return the names of files; of many, the first."""
+    names = [path.name for path in files]
+    return ", ".join(names[:SHOWN_NAMES]) + (f" and {len(names) - SHOWN_NAMES} more" if names[SHOWN_NAMES:] else "")
+
+
+def _distinct(files: Sequence[Path]) -> list[Path]:
+    """Return each file once, under the first of its names; those that are missing as they are."""
+    known: dict[object, Path] = {}
+    for file in files:
+        try:
+            found = file.stat()
+            known.setdefault((found.st_dev, found.st_ino), file)
+        except OSError:
+            known.setdefault(file, file)
+    return list(known.values())
 
 
 def _listed_files(folder: Path) -> list[Path]:
-    """Return the files that the folder's metadata.yaml lists, each once; none where it lists none."""
+    """Return the files that the folder's metadata.yaml lists, each once; none where it lists none.
+
+    Raises:
+        LogReadError: It is too large, or lists too many.
+    """
     path = folder / METADATA
-    if not path.is_file():
+    try:
+        if not path.is_file():
+            return []
+        if (size := path.stat().st_size) > METADATA_BYTES:
+            raise LogReadError(path, f"a list of files of {size} bytes, more than {METADATA_BYTES}")
+        names = _listed_names(path, path.read_text(encoding="utf-8"))
+    except (OSError, UnicodeDecodeError):
+        return []  # without it, the files are found by their names
+    if len(names) > MAX_FILES:
+        raise LogReadError(path, f"a list of {len(names)} files, more than {MAX_FILES}")
+    if not all(Path(name).name and len(name.encode()) <= MAX_NAME and "\0" not in name for name in names):
         return []
+    return list(dict.fromkeys(_present(folder / Path(name).name) for name in names))
+
+
+def _listed_names(path: Path, text: str) -> list[str]:
+    """Return the names of files in the text of metadata.yaml; none where it lists none, or is damaged.
+
+    Raises:
+        LogReadError: It is too large for what it is.
+    """
+    if plain := _PATHS.search(text):
+        names = [_PLAIN_NAME.fullmatch(line) for line in plain[1].splitlines()]
+        if all(names):
+            return [next(part for part in name.groups() if part is not None) for name in names if name]
+    if len(text) > YAML_BYTES:
+        raise LogReadError(path, f"{len(text)} characters that are not what rosbag2 writes")
     from ruamel.yaml import YAML
     from ruamel.yaml.error import YAMLError
 
-    try:
-        described: Any = YAML(typ="safe", pure=True).load(path.read_text(encoding="utf-8"))
-        names = described["rosbag2_bagfile_information"]["relative_file_paths"]
-    except (OSError, YAMLError, ValueError, KeyError, TypeError, RecursionError):
-        return []  # without it, the files are found by their names
-    if not isinstance(names, list) or not all(isinstance(name, str) and Path(name).name for name in names):
+    try:  # composed, not constructed: that takes exponentially long where there are aliases of aliases
+        node: Any = YAML(typ="safe", pure=True).compose(text)
+        for key in ("rosbag2_bagfile_information", "relative_file_paths"):
+            node = {name.value: value for name, value in node.value if isinstance(name.value, str)}[key]
+    except (YAMLError, ValueError, KeyError, TypeError, AttributeError, RecursionError):
         return []
-    return list(dict.fromkeys(_present(folder / Path(name).name) for name in names))
+    if not isinstance(node.value, list) or not all(getattr(item, "tag", "") == STRING_TAG for item in node.value):
+        return []
+    return [str(item.value) for item in node.value]
 
 
 def _present(file: Path) -> Path:
@@ -169,7 +242,9 @@ class PartsReader(LogReader):
             for file in files:
                 self._open_part(file, open_file)
             if not self._parts:
-                raise LogReadError(path, f"none of its {len(files)} files can be read: {'; '.join(self._missing)}")
+                raise LogReadError(
+                    path, f"none of its {len(files)} files can be read: {'; '.join(self._missing[:SHOWN_NAMES])}"
+                )
         except BaseException:
             self.close()
             raise
@@ -193,6 +268,11 @@ class PartsReader(LogReader):
     def close(self) -> None:
         """Close the files."""
         self._stack.close()
+
+    @property
+    def file_bytes(self) -> int:
+        """See :attr:`prim.log.reader.LogReader.file_bytes`."""
+        return sum(part.file_bytes for part in self._parts)
 
     @property
     def format(self) -> str:
@@ -249,6 +329,6 @@ class PartsReader(LogReader):
         if any(part.notes for part in self._parts) or any(b[0] < a[1] for a, b in pairwise(order)):
             return times
         self._parts = [self._parts[k] for k in positions]
-        names = ", ".join(part.path.name for part in self._parts)
+        names = _named([part.path for part in self._parts])
         self.notes = [f"the files of the bag are read in the order of their times: {names}"]
         return [times[k] for k in positions]

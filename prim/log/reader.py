@@ -12,12 +12,19 @@ import zstandard
 from prim.arrays import Stamps
 from prim.errors import LogReadError
 from prim.log.decoding.codecs import Codec, Content, codec_of
+from prim.log.limits import memory_limit, unpacked_limit
 from prim.log.log_file import ZSTD_MAGIC, LogFile
 from prim.log.source import Message, Numbered, Topic
 from prim.log.time_resets import LATEST, as_stamps
 
-MESSAGE_LIMIT = 1 << 30
-"""Messages of readable logs are no larger (bytes)."""
+MAX_LOST = 100
+"""So many losses are listed one by one."""
+
+MAX_REASON = 300
+"""Of the reason why a message cannot be decoded, so many characters are shown."""
+
+MIN_WINDOW = 1 << 23
+"""All frames of zstd that refer back no farther (bytes) are read (RFC 8878, 3.1.1.1.2, recommends that)."""
 
 
 class LogReader(ABC):
@@ -58,6 +65,11 @@ class LogReader(ABC):
         """The log's format, for people."""
         packed = self._file_of_log.compression if self._file_of_log else ""
         return f"{self._FORMAT} ({packed})" if packed else self._FORMAT
+
+    @property
+    def file_bytes(self) -> int:
+        """The size of its files as the user names them, which what reading may take depends on."""
+        return self._file_of_log.file_bytes if self._file_of_log else 0
 
     @abstractmethod
     def messages(self, *topics: str) -> Iterator[Message]:
@@ -106,6 +118,7 @@ class LogReader(ABC):
         self, decoders: Mapping[str, Callable[[bytes], object]], wanted: Container[int] | None
     ) -> Iterator[tuple[int, str, int, object]]:
         """Yield numbers, topics, log times and decoded messages; plain tuples, since scans are most of a log."""
+        decompressor = _Decompressor(self.file_bytes)
         for number, (name, log_time, data) in enumerate(self.messages(*decoders)):
             if wanted is not None and number not in wanted:
                 continue
@@ -116,36 +129,61 @@ class LogReader(ABC):
             try:
                 value = decode(data)
             except ValueError as error:
+                if not data.startswith(ZSTD_MAGIC):
+                    self._reject(name, number, error)
+                    continue
                 try:
-                    value = decode(_decompressed(data, error))
+                    value = decode(decompressor.decompressed(data))
                 except ValueError as final:
                     self._reject(name, number, final)
                     continue
             yield number, name, log_time, value
 
+    def _lose(self, what: str) -> None:
+        """Add a line to :attr:`lost`, once; of very many, the first."""
+        if len(self.lost) < MAX_LOST and what not in self.lost:
+            self.lost.append(what)
+            if len(self.lost) == MAX_LOST:
+                self.lost.append("and more")
+
     def _reject(self, topic: str, number: int, error: ValueError) -> None:
         """Count a message that cannot be decoded as lost; unless recovering, raise LogReadError."""
+        reason = str(error)[:MAX_REASON]
         if not self._recover:
-            what = f"message {number} of {topic} cannot be decoded: {error}"
+            what = f"message {number} of {topic} cannot be decoded: {reason}"
             raise LogReadError(self.path, what, "pass over such messages with --recover")
         if not any(name == topic for name, _ in self._undecodable):
-            self.lost.append(f"messages of {topic} that cannot be decoded, the first one {number}: {error}")
+            self.lost.append(f"messages of {topic} that cannot be decoded, the first one {number}: {reason}")
         self._undecodable.add((topic, number))
 
 
-def _decompressed(data: bytes, error: ValueError) -> bytes:
-    """Decompress a message that could not be decoded as it is. Raises ``error`` where it is no frame of zstd."""
-    if not data.startswith(ZSTD_MAGIC):
-        raise error
-    try:
-        with zstandard.ZstdDecompressor().stream_reader(data) as stream:
-            size = zstandard.frame_content_size(data)
-            message = stream.read(MESSAGE_LIMIT if size < 0 else min(size, MESSAGE_LIMIT))
-            if size > MESSAGE_LIMIT or stream.read(1):
-                raise ValueError(f"it is compressed, and larger than {MESSAGE_LIMIT} bytes")
-    except zstandard.ZstdError as damage:
-        raise ValueError(f"it is compressed, and damaged: {damage}") from damage
-    return message
+class _Decompressor:
+    """Decompresses messages that are each compressed, within the limits of the file that they are in.
+
+    Args:
+        file_bytes: Its size.
+    """
+
+    def __init__(self, file_bytes: int) -> None:
+        self._largest = memory_limit(file_bytes)
+        self._left = unpacked_limit(file_bytes)
+
+    def decompressed(self, data: bytes) -> bytes:
+        """Decompress a message that could not be decoded as it is. Raises ValueError."""
+        largest = min(self._largest, self._left)
+        try:
+            claimed = zstandard.frame_content_size(data)
+            if claimed > largest:
+                raise ValueError(f"it is compressed, and claims {claimed} bytes, more than {largest}")
+            unpacker = zstandard.ZstdDecompressor(max_window_size=max(largest, MIN_WINDOW))
+            with unpacker.stream_reader(data) as stream:
+                message = stream.read(largest if claimed < 0 else claimed)
+                if stream.read(1):
+                    raise ValueError(f"it is compressed, and larger than {len(message)} bytes")
+        except zstandard.ZstdError as damage:
+            raise ValueError(f"it is compressed, and damaged: {damage}") from damage
+        self._left -= len(message)
+        return message
 
 
 def ros2_name(name: str) -> str:

@@ -1,19 +1,27 @@
-"""A file of a ROS 2 bag in SQLite (.db3), of any version of its schema: all have the same columns of messages."""
+"""A file of a ROS 2 bag in SQLite (.db3), of any version of its schema: all have the same columns of messages.
+
+Queries go by the rows of the tables, in their order: an index could leave messages out.
+"""
 
 from __future__ import annotations
 
 import shutil
 import sqlite3
 import tempfile
+from array import array
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
+
 from prim.arrays import Stamps
 from prim.errors import LogReadError
 from prim.log.decoding.codecs import SCAN_CONTENTS, content_of
+from prim.log.limits import memory_limit, records_limit, unpacked_limit
 from prim.log.log_file import LogFile
 from prim.log.reader import LogReader
 from prim.log.recovery import RECOVER_HINT
@@ -27,7 +35,45 @@ MAX_STEP = 1 << 40
 """Behind damage, messages are searched for this far on (rows)."""
 
 MAX_ROW = 1 << 62
-"""Rows are numbered no higher, unless they are damaged."""
+"""Rows are numbered no higher, unless they are damaged, and times (ns) are no later."""
+
+CHECKED = (1 << 31) - 1
+"""Sums that are compared are of numbers modulo this one: they fit into 64 bits."""
+
+STEPS_BASE, STEPS_A_BYTE, STEPS_AT_ONCE = 20_000_000, 10, 100_000
+"""A query takes no more steps of SQLite than the first and the second for each byte; the third: how often that is
+checked. A row takes about 30 steps and at least 8 bytes, a step about 10 ns."""
+
+
+class _Table:
+    """Which rows hold messages, in their order: 20 bytes each."""
+
+    def __init__(self) -> None:
+        self._rows, self._topics, self._times = array("q"), array("q"), array("q")
+
+    def add(self, row: int, topic: int, time: int) -> None:
+        """Add a row: its number, its topic's, and its time (ns)."""
+        self._rows.append(row)
+        self._topics.append(topic)
+        self._times.append(time)
+
+    def __len__(self) -> int:
+        return len(self._rows)
+
+    @property
+    def rows(self) -> NDArray[np.int64]:
+        """The numbers of the rows (N,)."""
+        return np.array(self._rows, np.int64)
+
+    @property
+    def topics(self) -> NDArray[np.int64]:
+        """The numbers of their topics (N,)."""
+        return np.array(self._topics, np.int64)
+
+    @property
+    def times(self) -> Stamps:
+        """Their times (N,) in ns."""
+        return np.array(self._times, np.int64)
 
 
 class SqliteBagReader(LogReader):
@@ -47,13 +93,21 @@ class SqliteBagReader(LogReader):
         super().__init__(file.path, recover, file)
         self._folder: tempfile.TemporaryDirectory[str] | None = None
         self._is_cut = False
+        self._unpack_hint = file.unpack_hint
+        self._data_bytes = file.data.stat().st_size
+        self._steps = 0
+        self._numbers: dict[int, str] = {}
         try:
-            with _translated_errors(self.path, "" if recover else RECOVER_HINT):
+            with self._translated_errors("" if recover else RECOVER_HINT):
                 self._base = sqlite3.connect(self._address(file.data), uri=True, check_same_thread=False)
-                if recover:
-                    self._base.execute("PRAGMA writable_schema = ON")  # or a file that is cut cannot be opened
-                self._numbers: dict[int, str] = {}
-                self.topics = self._read_topics()
+                self._restrict()
+                self._check_tables()
+                topics = self._read_topics()
+                self._check_sizes()
+                self._table = self._read_rows()
+                self._check_index()
+            counts = Counter(self._table.topics.tolist())
+            self.topics = self._counted(topics, counts)
             self._shifts = self._find_shifts()
         except BaseException:
             self.close()
@@ -64,6 +118,7 @@ class SqliteBagReader(LogReader):
         """Return the address of the database; of a copy where changes are to be made to it first."""
         pending = [path.with_name(path.name + suffix) for suffix in PENDING]
         pending = [file for file in pending if file.is_file() and file.stat().st_size]
+        self._data_bytes += sum(file.stat().st_size for file in pending)
         if not pending:
             return f"{path.absolute().as_uri()}?immutable=1"
         self._folder = tempfile.TemporaryDirectory(prefix="prim-", ignore_cleanup_errors=True)
@@ -85,97 +140,189 @@ class SqliteBagReader(LogReader):
         """The number of messages that could not be read; None where the log does not say how many there were."""
         return None if self._is_cut else super().messages_lost
 
-    def _read_topics(self) -> dict[str, Topic]:
-        tables = {name for (name,) in self._base.execute("SELECT name FROM sqlite_master WHERE type = 'table'")}
-        if not {"topics", "messages"} <= tables:
-            raise LogReadError(self.path, "a database of SQLite, but no ROS 2 bag: it lacks the tables of one")
-        counts = self._counts()
-        topics: dict[str, Topic] = {}
-        for number, name, kind, encoding in self._base.execute(
-            "SELECT id, name, type, serialization_format FROM topics ORDER BY id"
-        ):
-            self._numbers[number] = name
-            count = counts[number] + (topics[name].messages if name in topics else 0)
-            topics[name] = Topic(name, kind, encoding, count, content_of(kind))
-        return topics
-
-    def _counts(self) -> Counter[int]:
-        """Return how many messages each topic has."""
+    def _restrict(self) -> None:
+        """Let the database run no code of its own, change nothing, and take no more than its size allows."""
+        self._base.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, min(memory_limit(self.file_bytes), (1 << 30) - 1))
+        self._base.execute("PRAGMA trusted_schema = OFF")
+        self._base.execute("PRAGMA query_only = ON")
+        self._base.set_progress_handler(self._count_steps, STEPS_AT_ONCE)
         if self._recover:
-            return Counter(topic for _, topic in self._rows("topic_id", ()))
-        return Counter(dict(self._base.execute("SELECT topic_id, COUNT(*) FROM messages GROUP BY topic_id")))
+            self._base.execute("PRAGMA writable_schema = ON")  # or a file that is cut cannot be opened
+
+    def _count_steps(self) -> bool:
+        """Return whether a query is to be stopped, since it takes too many steps."""
+        self._steps += STEPS_AT_ONCE
+        return self._takes_too_long
+
+    @property
+    def _takes_too_long(self) -> bool:
+        return self._steps > STEPS_BASE + STEPS_A_BYTE * self._data_bytes
+
+    def _query(self, query: str, values: Sequence[Any] = ()) -> sqlite3.Cursor:
+        self._steps = 0
+        return self._base.execute(query, values)
+
+    def _check_tables(self) -> None:
+        """Raise LogReadError where the tables are no plain ones, of rows that are stored as they are."""
+        query = "SELECT name FROM sqlite_master WHERE type = 'table' AND rootpage > 0"  # else it is a virtual one
+        if not {"topics", "messages"} <= {name for (name,) in self._query(query)}:
+            raise LogReadError(self.path, "a database of SQLite, but no ROS 2 bag: it lacks the tables of one")
+        for table in ("topics", "messages"):
+            if any(hidden for *_, hidden in self._query(f"PRAGMA table_xinfo({table})")):
+                raise LogReadError(self.path, "a database of SQLite, but no ROS 2 bag: it has generated columns")
+
+    def _read_topics(self) -> list[Topic]:
+        """Read the topics, without their numbers of messages."""
+        topics = []
+        query = "SELECT id, name, type, serialization_format FROM topics NOT INDEXED ORDER BY rowid"
+        for number, *texts in self._query(query):
+            if not isinstance(number, int) or not all(isinstance(text, str) for text in texts):
+                self._damage("a topic whose number or type is none")
+            elif self._numbers.setdefault(number, texts[0]) != texts[0]:
+                self._damage(f"topic {number} is listed twice")
+            else:
+                name, kind, encoding = texts
+                topics.append((number, Topic(name, kind, encoding, 0, content_of(kind))))
+            if len(topics) > records_limit(self.file_bytes):
+                raise LogReadError(self.path, f"more than {len(topics)} topics")
+        return [topic for _, topic in sorted(topics, key=lambda item: item[0])]
+
+    def _check_sizes(self) -> None:
+        """Raise LogReadError where rows claim more than the file has: several may share pages of a damaged one."""
+        query = "SELECT SUM(CASE typeof(data) WHEN 'blob' THEN LENGTH(data) END) FROM messages NOT INDEXED"
+        try:
+            ((claimed,),) = self._query(query)
+        except sqlite3.DatabaseError:
+            if not self._recover:
+                raise
+            return
+        if (claimed or 0) > self._data_bytes:
+            self._damage(f"its messages claim {claimed} bytes of {self._data_bytes}")
+
+    def _read_rows(self) -> _Table:
+        """Read which messages there are."""
+        table = _Table()
+        limit = records_limit(self.file_bytes)
+        for row, number, time, kind in self._rows("topic_id, timestamp, typeof(data)"):
+            if not isinstance(number, int) or number not in self._numbers:
+                self._damage("messages of a topic that is not listed")
+            elif not isinstance(time, int) or abs(time) > MAX_ROW or kind not in ("blob", "null"):
+                self._damage("messages whose time is no number, or whose data are no bytes")
+            else:
+                table.add(row, number, time)
+            if len(table) > limit:
+                raise LogReadError(
+                    self.path, f"more than {limit} messages in {self.file_bytes} bytes", self._unpack_hint
+                )
+        return table
+
+    def _check_index(self) -> None:
+        """Compare the messages with an index of their times, where there is one: rows may be lost without a trace."""
+        for _, index, _, _, is_partial in self._query("PRAGMA index_list(messages)").fetchall():
+            name = '"' + index.replace('"', '""') + '"'
+            columns = [column for *_, column in self._query(f"PRAGMA index_info({name})")]
+            if columns != ["timestamp"] or is_partial or self._is_cut:
+                continue
+            query = f"SELECT COUNT(*), SUM(timestamp % ?), SUM(rowid % ?) FROM messages INDEXED BY {name}"
+            try:
+                count, *found = self._query(query, (CHECKED, CHECKED)).fetchone()
+            except sqlite3.DatabaseError as error:
+                self._damage(f"its index of times cannot be read: {error}")
+                continue
+            sums = [int(np.fmod(values, CHECKED).sum()) for values in (self._table.times, self._table.rows)]
+            if count != len(self._table) or (count and found != sums):
+                self._damage(f"its index has {count} messages, which are not the {len(self._table)} that are there")
+
+    def _damage(self, what: str) -> None:
+        """Note what is lost; unless recovering, raise LogReadError."""
+        if not self._recover:
+            raise LogReadError(self.path, f"damaged: {what}", RECOVER_HINT)
+        self._is_cut = True
+        self._lose(what)
+
+    def _counted(self, topics: Sequence[Topic], counts: Counter[int]) -> dict[str, Topic]:
+        """Return the topics by name, with their numbers of messages."""
+        messages: Counter[str] = Counter()
+        for number, name in self._numbers.items():
+            messages[name] += counts[number]
+        return {topic.name: topic._replace(messages=messages[topic.name]) for topic in topics}
 
     def _find_shifts(self) -> tuple[int, ...]:
         """Find out whether the log's times were set back."""
         scans = [number for number, name in self._numbers.items() if self.topics[name].content in SCAN_CONTENTS]
         if not scans:
             return (0,)
-        columns, where = "timestamp", f"topic_id = {scans[0]}"
-        if self._recover:
-            times = [time for _, time in self._rows(columns, scans[:1])]
-        else:
-            with _translated_errors(self.path, RECOVER_HINT):
-                query = f"SELECT {columns} FROM messages WHERE {where} ORDER BY rowid"
-                times = [time for (time,) in self._base.execute(query)]
-        return find_shifts(as_stamps(times))
+        return find_shifts(as_stamps(self._table.times[self._table.topics == scans[0]].tolist()))
+
+    def _selected(self, topics: Sequence[str]) -> NDArray[np.int64]:
+        """Return which messages (M,) are of these topics: by their times, or as written where that is more."""
+        numbers = [number for number, name in self._numbers.items() if name in topics]
+        selected = np.flatnonzero(np.isin(self._table.topics, np.array(numbers, np.int64)))
+        if self._recover or len(self._shifts) > 1:
+            return selected
+        by_time: NDArray[np.int64] = selected[np.argsort(self._table.times[selected], kind="stable")]
+        return by_time
 
     def log_times(self, topic: str) -> Stamps:
         """See :meth:`prim.log.reader.LogReader.log_times`: without reading the messages."""
         if self._recover or len(self._shifts) > 1:
             return super().log_times(topic)
-        numbers = [number for number, name in self._numbers.items() if name == topic]
-        query = (
-            f"SELECT timestamp FROM messages WHERE topic_id IN ({', '.join('?' * len(numbers))}) ORDER BY timestamp"
-        )
-        with _translated_errors(self.path, RECOVER_HINT):
-            return as_stamps(time for (time,) in self._base.execute(query, numbers))
+        return as_stamps(self._table.times[self._selected((topic,))].tolist())
 
     def messages(self, *topics: str) -> Iterator[Message]:
         """See :meth:`prim.log.source.LogSource.messages`; a log that is recovered is read in the order of writing."""
-        found = self._stored_messages([number for number, name in self._numbers.items() if name in topics])
+        found = self._stored_messages(self._selected(topics))
         return moved_behind_resets(found, self._shifts) if len(self._shifts) > 1 else found
 
-    def _stored_messages(self, numbers: Sequence[int]) -> Iterator[Message]:
-        """Yield the messages of these topics: by their times, or as they were written where that is more."""
-        if self._recover:
-            for _, number, time, data in self._rows("topic_id, timestamp, data", numbers):
-                yield Message(self._numbers[number], time, data or b"")
-            return
-        order = "rowid" if len(self._shifts) > 1 else "timestamp, rowid"
-        marks = ", ".join("?" * len(numbers))
-        query = f"SELECT topic_id, timestamp, data FROM messages WHERE topic_id IN ({marks}) ORDER BY {order}"
-        with _translated_errors(self.path, RECOVER_HINT):
-            for number, time, data in self._base.execute(query, numbers):
-                yield Message(self._numbers[number], time, data or b"")
+    def _stored_messages(self, selected: NDArray[np.int64]) -> Iterator[Message]:
+        """Yield the messages of these rows, one by one."""
+        left = unpacked_limit(self._data_bytes)
+        rows, topics, times = self._table.rows, self._table.topics, self._table.times
+        for k in selected.tolist():
+            with self._translated_errors(RECOVER_HINT):
+                try:
+                    found = self._query("SELECT data FROM messages WHERE rowid = ?", (int(rows[k]),)).fetchone()
+                except sqlite3.DatabaseError as error:
+                    if not self._recover:
+                        raise
+                    self._damage(f"messages in damaged pages of the database: {error}")
+                    continue
+            data = (found[0] if found else None) or b""
+            left -= len(data)
+            if left < 0:
+                what = f"its messages claim more than the {self._data_bytes} bytes that there are"
+                raise LogReadError(self.path, f"damaged: {what}")
+            yield Message(self._numbers[int(topics[k])], int(times[k]), data)
 
-    def _rows(self, columns: str, numbers: Sequence[int]) -> Iterator[tuple[Any, ...]]:
-        """Yield rowid and columns of the messages of these topics (none: of all) as written, past what is damaged."""
-        query = f"SELECT topic_id, rowid, {columns} FROM messages WHERE rowid > ? ORDER BY rowid LIMIT ?"
-        at, step, limit = -1, 0, -1
+    def _rows(self, columns: str) -> Iterator[tuple[Any, ...]]:
+        """Yield rowid and columns of all messages as written, past what is damaged where that is to be recovered."""
+        query = f"SELECT rowid, {columns} FROM messages NOT INDEXED WHERE rowid > ? ORDER BY rowid LIMIT ?"
+        at, step, limit = -MAX_ROW, 0, -1
         while step < MAX_STEP and at < MAX_ROW:
             try:
-                for number, *row in self._base.execute(query, (at, limit)):
-                    if row[0] <= at:
+                for row in self._query(query, (at, limit)):
+                    if not isinstance(row[0], int) or row[0] <= at:
                         raise sqlite3.DatabaseError("its pages do not fit together")
                     at, step = row[0], 0
-                    if not numbers or number in numbers:
-                        yield tuple(row)
+                    yield row
                 if limit < 0:
                     return
                 limit = -1  # the last row before the damage was read by itself
             except sqlite3.DatabaseError as error:
-                self._is_cut = True
-                what = f"messages in damaged pages of the database: {error}"
-                self.lost += [what] * (what not in self.lost)
-                at, step, limit = at + step, 2 * step + 1, 1
+                if self._takes_too_long:
+                    raise
+                self._damage(f"messages in damaged pages of the database: {error}")
+                at, step, limit = max(at, -1) + step, 2 * step + 1, 1
 
-
-@contextmanager
-def _translated_errors(path: Path, hint: str) -> Iterator[None]:
-    """Turn what SQLite raises into a LogReadError that names ``path``."""
-    try:
-        yield
-    except sqlite3.DatabaseError as error:
-        raise LogReadError(path, f"damaged, or no ROS 2 bag: {error}", hint) from error
-    except (OSError, UnicodeDecodeError) as error:
-        raise LogReadError(path, f"cannot be read: {getattr(error, 'strerror', None) or error}") from error
+    @contextmanager
+    def _translated_errors(self, hint: str) -> Iterator[None]:
+        """Turn what SQLite raises into a LogReadError."""
+        try:
+            yield
+        except sqlite3.DatabaseError as error:
+            if self._takes_too_long:
+                what = f"a query of its {self._data_bytes} bytes takes too many steps"
+                raise LogReadError(self.path, f"damaged, or no ROS 2 bag: {what}") from error
+            raise LogReadError(self.path, f"damaged, or no ROS 2 bag: {error}", hint) from error
+        except (OSError, UnicodeDecodeError) as error:
+            raise LogReadError(self.path, f"cannot be read: {getattr(error, 'strerror', None) or error}") from error

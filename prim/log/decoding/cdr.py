@@ -3,12 +3,17 @@
 from __future__ import annotations
 
 import struct
+from collections.abc import Iterator
 
 import numpy as np
 from numpy.typing import NDArray
 
 SECOND = 1_000_000_000
 """Nanoseconds."""
+
+
+MAX_ITEMS = 100_000
+"""A message has no more transforms or fields; an item takes up to 8 times as much memory as bytes; set by hand."""
 
 
 class CdrError(ValueError):
@@ -62,6 +67,23 @@ class CdrReader:
         if count * item_size > len(self._data) - self._at:
             raise CdrError(f"it claims {count} items at byte {self._at} of {len(self._data)}")
         return count
+
+    def items(self, limit: int = MAX_ITEMS) -> Iterator[int]:
+        """Read the length of a sequence of messages, and iterate over their numbers.
+
+        Args:
+            limit: So many are allowed.
+
+        Yields:
+            The numbers.
+
+        Raises:
+            CdrError: It claims more, or more than there are bytes.
+        """
+        count = self.length(1)
+        if count > limit:
+            raise CdrError(f"it claims {count} items, more than {limit}")
+        yield from range(count)
 
     def string(self) -> str:
         """Read a string, without its closing NUL."""

@@ -14,9 +14,16 @@ from typing import Any
 import numpy as np
 
 from prim import strict_json
-from prim.log.decoding.cdr import SECOND
-from prim.log.decoding.values import PointCloud, StampedPose, StampedVector, checked_stamp, planar_pose
-from prim.scan import Scan
+from prim.log.decoding.cdr import MAX_ITEMS, SECOND
+from prim.log.decoding.values import (
+    PointCloud,
+    StampedPose,
+    StampedVector,
+    checked_count,
+    checked_stamp,
+    planar_pose,
+)
+from prim.scan import MAX_BEAMS, Scan
 from prim.se2 import Pose2D
 
 NUMPY_TYPES = {1: "u1", 2: "i1", 3: "u2", 4: "i2", 5: "u4", 6: "i4", 7: "f4", 8: "f8"}
@@ -27,6 +34,9 @@ NUMERIC_TYPES = {
     for number, name in enumerate(("UINT8", "INT8", "UINT16", "INT16", "UINT32", "INT32", "FLOAT32", "FLOAT64"), 1)
 }
 """Their names, as protobuf's own JSON has them."""
+
+MAX_JSON_ITEMS = 1 << 20
+"""A message in JSON has no more values: each takes up to 240 bytes of memory; set by hand."""
 
 MAX_SHIFT = 1e-6
 """A laser's origin farther than this (m) from its frame's is not at it."""
@@ -64,6 +74,9 @@ class _Missing(JsonFields):
     def __iter__(self) -> Any:
         return iter(())
 
+    def __len__(self) -> int:
+        return 0
+
     def __bool__(self) -> bool:
         return False
 
@@ -87,6 +100,8 @@ def _as_fields(value: Any) -> Any:
 
 def parse_json(data: bytes) -> Any:
     """Parse a message in JSON. Raises ValueError."""
+    if sum(map(data.count, (b",", b"[", b"{"))) > MAX_JSON_ITEMS:
+        raise ValueError(f"a message in JSON of more than {MAX_JSON_ITEMS} values")
     value = strict_json.loads(data)
     if not isinstance(value, dict):
         raise ValueError("a message in JSON that is no object")
@@ -107,12 +122,50 @@ def protobuf_parser(name: str) -> Callable[[bytes], Any]:
     message_type = _message_type(name)
 
     def parse(data: bytes) -> Any:
+        check_field_count(data)
         try:
             return message_type.FromString(data)
         except DecodeError as error:
             raise ValueError(f"no foxglove.{name} in protobuf: {error}") from error
 
     return parse
+
+
+def check_field_count(data: bytes) -> None:
+    """Raise ValueError where a message in protobuf has too many fields: one of 2 bytes takes 150 of memory."""
+    at, count = 0, 0
+    try:
+        while at < len(data):
+            count += 1
+            if count > MAX_ITEMS:
+                raise ValueError(f"a message in protobuf of more than {MAX_ITEMS} fields")
+            tag, at = _varint(data, at)
+            if tag & 7 == _LENGTH_DELIMITED:
+                size, at = _varint(data, at)
+                at += size
+            elif tag & 7 == _VARINT:
+                _, at = _varint(data, at)
+            else:
+                at += _FIXED_BYTES.get(tag & 7, 0)
+    except IndexError:
+        return  # an error when it is parsed
+
+
+_VARINT, _LENGTH_DELIMITED = 0, 2
+_FIXED_BYTES = {1: 8, 5: 4}
+"""The wire types of protobuf (https://protobuf.dev/programming-guides/encoding/)."""
+
+
+def _varint(data: bytes, at: int) -> tuple[int, int]:
+    """Return the number of up to ten bytes that begins at a byte, and where it ends. Raises IndexError."""
+    value = 0
+    for shift in range(0, 70, 7):
+        byte = data[at]
+        at += 1
+        value |= (byte & 0x7F) << shift
+        if byte < 0x80:
+            return value, at
+    raise IndexError
 
 
 def _message_type(name: str) -> Any:
@@ -141,13 +194,15 @@ def read_scan(message: Any) -> Scan:
     absent = [name for name in ("start_angle", "end_angle", "ranges") if type(getattr(message, name)) is _Missing]
     if absent:
         raise ValueError(f"a scan without {absent[0]}")
+    if len(message.ranges) > MAX_BEAMS:
+        raise ValueError(f"a scan of {len(message.ranges)} beams, more than {MAX_BEAMS}")
     ranges = np.array([_number(z) for z in message.ranges] if _is_json(message) else message.ranges, dtype=np.float32)
     first, last = float(message.start_angle), float(message.end_angle)
     increment = (last - first) / (len(ranges) - 1) if len(ranges) > 1 else 0.0
     turn = _turn_of_origin(message)
     return Scan(
         read_stamp(message),
-        str(message.frame_id),
+        _text(message.frame_id),
         first + turn,
         increment,
         0.0,
@@ -168,12 +223,12 @@ def _turn_of_origin(message: Any) -> float:
 def read_cloud(message: Any) -> PointCloud:
     """Read a foxglove.PointCloud that has x, y and, unless it is flat, z."""
     turn = _turn_of_origin(message)
-    data = base64.b64decode(message.data, validate=True) if isinstance(message.data, str) else bytes(message.data)
+    data = _octets(message.data)
     stride = int(message.point_stride)
-    fields = {str(field.name): (int(field.offset), _numeric_type(field.type)) for field in message.fields}
+    fields = {_text(field.name): (int(field.offset), _numeric_type(field.type)) for field in message.fields}
     if stride < 1 or len({"x", "y"} & fields.keys()) < 2:
         raise ValueError("a cloud without x and y")
-    points = np.zeros((len(data) // stride, 3))
+    points = np.zeros((checked_count(len(data) // stride), 3))
     for k, axis in enumerate("xyz"):
         if axis in fields and len(points):
             offset, kind = fields[axis]
@@ -181,7 +236,7 @@ def read_cloud(message: Any) -> PointCloud:
                 raise ValueError(f"{axis} of a cloud cannot be read")
             points[:, k] = np.ndarray(len(points), "<" + NUMPY_TYPES[kind], data, offset, (stride,))
     points[:, :2] = Pose2D(0.0, 0.0, turn).apply(points[:, :2])
-    return PointCloud(read_stamp(message), str(message.frame_id), points)
+    return PointCloud(read_stamp(message), _text(message.frame_id), points)
 
 
 def _numeric_type(value: Any) -> int:
@@ -194,8 +249,8 @@ def read_transform(message: Any) -> list[StampedPose]:
     return [
         StampedPose(
             read_stamp(message),
-            str(message.parent_frame_id),
-            str(message.child_frame_id),
+            _text(message.parent_frame_id),
+            _text(message.child_frame_id),
             _xyz(message.translation),
             _rotation(message.rotation),
         )
@@ -209,13 +264,13 @@ def read_transforms(message: Any) -> list[StampedPose]:
 
 def read_pose(message: Any) -> list[StampedPose]:
     """Read a foxglove.PoseInFrame."""
-    return [_pose(message.pose, read_stamp(message), str(message.frame_id), "")]
+    return [_pose(message.pose, read_stamp(message), _text(message.frame_id), "")]
 
 
 def read_fix(message: Any) -> StampedVector:
     """Read a foxglove.LocationFix: latitude and longitude (degrees), altitude (m)."""
     place = (_number(message.latitude), _number(message.longitude), _number(message.altitude))
-    return StampedVector(read_stamp(message), str(message.frame_id), *place)
+    return StampedVector(read_stamp(message), _text(message.frame_id), *place)
 
 
 def read_stamp(message: Any) -> int:
@@ -225,10 +280,10 @@ def read_stamp(message: Any) -> int:
         return 0
     if isinstance(stamp, str):  # as protobuf's own JSON has it (RFC 3339)
         time = datetime.fromisoformat(stamp)
-        return round((time if time.tzinfo else time.replace(tzinfo=UTC)).timestamp() * SECOND)
+        return checked_stamp(round((time if time.tzinfo else time.replace(tzinfo=UTC)).timestamp() * SECOND))
     if not isinstance(stamp, JsonFields):
         if not hasattr(stamp, "nanos"):
-            raise ValueError(f"its timestamp, {stamp!r}, is none of seconds and nanoseconds")
+            raise ValueError(f"its timestamp, {strict_json.shown(stamp)}, is none of seconds and nanoseconds")
         return checked_stamp(int(stamp.seconds) * SECOND + int(stamp.nanos))
     for seconds, nanoseconds in ((stamp.sec, stamp.nsec), (stamp.sec, stamp.nanosec), (stamp.seconds, stamp.nanos)):
         if not isinstance(seconds, _Missing) and not isinstance(nanoseconds, _Missing):
@@ -258,8 +313,28 @@ def _number(value: Any) -> float:
     try:
         return math.nan if value is None else float(value)
     except TypeError as error:
-        what = "an object" if isinstance(value, dict | JsonFields) else repr(value)
+        what = "an object" if isinstance(value, dict | JsonFields) else strict_json.shown(value)
         raise ValueError(f"{what} is no number") from error
+
+
+def _text(value: Any) -> str:
+    """Return a text; empty where there is none. Raises ValueError."""
+    if isinstance(value, _Missing):
+        return ""
+    if not isinstance(value, str):
+        raise ValueError(f"{strict_json.shown(value)} is no text")
+    return value
+
+
+def _octets(value: Any) -> bytes:
+    """Return bytes, which JSON has in base64. Raises ValueError."""
+    if isinstance(value, _Missing):
+        return b""
+    if isinstance(value, str):
+        return base64.b64decode(value, validate=True)
+    if not isinstance(value, bytes):
+        raise ValueError(f"{strict_json.shown(value)} are no bytes in base64")
+    return value
 
 
 def _is_json(message: Any) -> bool:

@@ -17,14 +17,27 @@ from prim import strict_json
 from prim.arrays import FloatArray
 from prim.log.decoding.cdr import SECOND, CdrError, CdrReader
 from prim.log.decoding.ros1 import Ros1Reader
-from prim.log.decoding.values import PointCloud, StampedPose, StampedPrimitives, StampedVector, planar_pose
-from prim.scan import Scan
+from prim.log.decoding.values import (
+    PointCloud,
+    StampedPose,
+    StampedPrimitives,
+    StampedVector,
+    checked_count,
+    planar_pose,
+)
+from prim.scan import MAX_BEAMS, Scan
 from prim.shapes import Primitive
 
 SCAN_HEAD, SCAN_GEOMETRY = struct.Struct("<iII"), struct.Struct("<7fI")
 """A LaserScan up to its frame: seconds, nanoseconds, length of the frame; behind it: angles, times, limits, count."""
 _FRAME_AT = 4 + SCAN_HEAD.size
 """Where the frame of a message in CDR that begins with a header begins (bytes)."""
+
+MAX_PRIMITIVES = 10_000
+"""A world has no more primitives; set by hand."""
+
+MAX_TEXT = 1 << 12
+"""What a marker says of its primitive, kind and size, is no longer (characters)."""
 
 FLOAT_TYPES = {7: "f4", 8: "f8"}
 """The codes of sensor_msgs/PointField for numbers of floating point, and what they mean to NumPy."""
@@ -67,7 +80,7 @@ def _read_scan(fields: CdrReader, read_ranges: Callable[[CdrReader], NDArray[np.
 
 def _first_echoes(fields: CdrReader) -> NDArray[np.float32]:
     first = []
-    for _ in range(fields.length(4)):
+    for _ in fields.items(MAX_BEAMS):
         echoes = fields.floats()
         first.append(echoes[0] if len(echoes) else math.nan)
     return np.array(first, dtype=np.float32)
@@ -78,7 +91,7 @@ def read_cloud(fields: CdrReader) -> PointCloud:
     stamp, frame_id = fields.header()
     height, width = (int(size) for size in fields.unpack("II", 4))
     columns: dict[str, tuple[int, int]] = {}
-    for _ in range(fields.length(1)):
+    for _ in fields.items():
         name = fields.string()
         offset = int(fields.unpack("I", 4)[0])
         kind = int(fields.unpack("B", 1)[0])
@@ -109,6 +122,7 @@ def _points(
     data: bytes,
 ) -> FloatArray:
     """Return the points (N, 3) of a cloud's bytes; z is 0 where there is none."""
+    checked_count(height * width)
     points = np.zeros((height, width, 3))
     for k, axis in enumerate("xyz"):
         if axis not in columns:
@@ -149,7 +163,7 @@ def read_odometry(fields: CdrReader) -> list[StampedPose]:
 
 def read_transforms(fields: CdrReader) -> list[StampedPose]:
     """Read a tf2_msgs/TFMessage."""
-    return [_read_pose(fields, *fields.header(), fields.string()) for _ in range(fields.length(1))]
+    return [_read_pose(fields, *fields.header(), fields.string()) for _ in fields.items()]
 
 
 def _read_pose(fields: CdrReader, stamp: int, frame_id: str, child_frame_id: str) -> StampedPose:
@@ -161,13 +175,13 @@ def _read_pose(fields: CdrReader, stamp: int, frame_id: str, child_frame_id: str
 def read_primitives(fields: CdrReader) -> StampedPrimitives:
     """Invert :func:`prim.log.messages.encode_primitives`, but for the walls."""
     stamp, primitives = 0, []
-    for _ in range(fields.length(1)):  # a marker has at least one byte
+    for _ in fields.items(MAX_PRIMITIVES):
         pose, namespace, text = _read_marker(fields)
         stamp = pose.stamp
         if namespace == "primitives":
-            truth = strict_json.loads(text)
+            truth = strict_json.loads(text) if len(text) <= MAX_TEXT else None
             if not isinstance(truth, dict):
-                raise ValueError(f"a marker's text is no object: {text}")
+                raise ValueError(f"a marker's text is no object: {strict_json.shown(text)}")
             plane = planar_pose(pose)
             primitive = Primitive.from_json({**truth, "x": plane.x, "y": plane.y, "theta": plane.theta})
             primitives.append(primitive.canonical())

@@ -9,6 +9,9 @@ from prim.arrays import FloatArray
 from prim.se2 import Pose2D
 from prim.shapes import Primitive
 
+MAX_POINTS = 1 << 22
+"""A cloud has no more points: each takes 24 bytes, whatever the message has of it; set by hand."""
+
 
 class StampedPose(NamedTuple):
     """A pose as messages hold it.
@@ -84,8 +87,15 @@ def quaternion(heading: float) -> tuple[float, float, float, float]:
     return 0.0, 0.0, math.sin(heading / 2), math.cos(heading / 2)
 
 
+def checked_count(points: int) -> int:
+    """Return a number of points that a cloud may have. Raises ValueError."""
+    if points > MAX_POINTS:
+        raise ValueError(f"a cloud of {points} points, more than {MAX_POINTS}")
+    return points
+
+
 def checked_stamp(stamp: int) -> int:
     """Return a stamp (ns) that fits into 64 bits, and leaves room to compute with. Raises ValueError."""
     if abs(stamp) >= 1 << 62:
-        raise ValueError(f"its stamp, {stamp / 1e9:g} s, is beyond all times")
+        raise ValueError("its stamp is beyond all times (2^62 ns)")
     return stamp
