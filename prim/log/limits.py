@@ -29,7 +29,7 @@ class LogLimits:
     unpacked_base: int = 64 << 20
     unpacked_growth: int = 256
     records_base: int = 50_000
-    bytes_per_record: int = 16
+    bytes_per_record: int = 4
 
 
 LIMITS = LogLimits()

@@ -19,6 +19,7 @@ from prim.log.decoding.codecs import SCAN_CONTENTS
 from prim.log.reader import LogReader
 from prim.log.source import Message, Topic
 from prim.log.time_resets import find_shifts, moved_behind_resets, reset_notes
+from prim.text import MOST_LISTED, listed
 
 METADATA = "metadata.yaml"
 """The file in a ROS 2 bag's folder that lists the others."""
@@ -41,9 +42,6 @@ STRING_TAG = "tag:yaml.org,2002:str"
 MAX_NAME = 255
 """A file's name is no longer (bytes)."""
 
-SHOWN_NAMES = 20
-"""So many files are named where there are more."""
-
 _PATHS = re.compile(r"^ *relative_file_paths:[ \t]*\n((?: *- [^\n]*(?:\n|\Z))+)", re.MULTILINE)
 _PLAIN_NAME = re.compile(r""" *- (?:"([^"\\]*)"|'([^']*)'|(\w[\w.+ ()-]*[A-Za-z][\w.+ ()-]*))[ \t]*""")
 """The list of files as rosbag2 writes it, and a file in it whose name needs no YAML to be read."""
@@ -64,19 +62,19 @@ def files_of_bag(folder: Path) -> list[Path]:
     Raises:
         LogReadError: The folder holds no log, or several that do not belong together.
     """
-    listed = _distinct(_listed_files(folder))
-    if any(file.exists() for file in listed):
-        return listed
+    named = _distinct(_listed_files(folder))
+    if any(file.exists() for file in named):
+        return named
     by_stem = {_stem(path): path for path in sorted(folder.iterdir(), key=_preference, reverse=True) if _is_log(path)}
     found = _distinct(sorted(by_stem.values(), key=_part_number))
-    if not found and listed:
-        return listed
+    if not found and named:
+        return named
     if not found:
         raise LogReadError(folder, "a folder without a log in it", "give a log, or the folder of a ROS 2 bag")
     if len(found) > 1 and len({_part_number(path)[0] for path in found}) > 1:
         raise LogReadError(
             folder,
-            f"a folder with {len(found)} logs ({_named(found)})",
+            f"a folder with {len(found)} logs ({listed(path.name for path in found)})",
             f"give one of them: {shlex.quote(str(found[0]))}",
         )
     return found
@@ -118,13 +116,8 @@ def notes_on_unlisted(folder: Path, files: Sequence[Path]) -> list[str]:
     bags = {_part_number(file)[0] for file in files}
     others = [path for path in folder.iterdir() if _is_log(path) and _stem(path) not in read]
     parts = [path for path in sorted(others, key=_part_number) if _part_number(path)[0] in bags]
-    return [f"{METADATA} does not list {_named(parts)}: not read; without {METADATA}, all are"] if parts else []
-
-
-def _named(files: Sequence[Path]) -> str:
-    """Return the names of files; of many, the first."""
-    names = [path.name for path in files]
-    return ", ".join(names[:SHOWN_NAMES]) + (f" and {len(names) - SHOWN_NAMES} more" if names[SHOWN_NAMES:] else "")
+    names = listed(path.name for path in parts)
+    return [f"{METADATA} does not list {names}: not read; without {METADATA}, all are"] if parts else []
 
 
 def _distinct(files: Sequence[Path]) -> list[Path]:
@@ -243,7 +236,7 @@ class PartsReader(LogReader):
                 self._open_part(file, open_file)
             if not self._parts:
                 raise LogReadError(
-                    path, f"none of its {len(files)} files can be read: {'; '.join(self._missing[:SHOWN_NAMES])}"
+                    path, f"none of its {len(files)} files can be read: {'; '.join(self._missing[:MOST_LISTED])}"
                 )
         except BaseException:
             self.close()
@@ -329,6 +322,6 @@ class PartsReader(LogReader):
         if any(part.notes for part in self._parts) or any(b[0] < a[1] for a, b in pairwise(order)):
             return times
         self._parts = [self._parts[k] for k in positions]
-        names = _named([part.path for part in self._parts])
+        names = listed(part.path.name for part in self._parts)
         self.notes = [f"the files of the bag are read in the order of their times: {names}"]
         return [times[k] for k in positions]

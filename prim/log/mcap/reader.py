@@ -18,7 +18,7 @@ from mcap.records import Attachment, Channel, Metadata, Schema
 from prim.arrays import Stamps
 from prim.errors import LogReadError
 from prim.log.decoding.codecs import SCAN_CONTENTS, content_of
-from prim.log.limits import megabytes, memory_limit
+from prim.log.limits import megabytes, memory_limit, records_limit, unpacked_limit
 from prim.log.log_file import LogFile
 from prim.log.mcap.records import (
     INDEX_ENTRY_BYTES,
@@ -65,13 +65,17 @@ class McapReader(LogReader):
     def __init__(self, file: LogFile, recover: bool = False) -> None:
         super().__init__(file.path, recover, file)
         self._limit = memory_limit(file.file_bytes)
+        self._most_records = records_limit(file.file_bytes)
         self._file: IO[bytes] = file.data.open("rb")
         self._definitions = _Definitions()
         self._times: dict[int, Stamps] = {}
         try:
             with damage_refused(self.path):
                 self._survey = Surveyor(self._file, recover, self.lost).survey()
+                self._check_size(unpacked_limit(file.file_bytes))
                 self._counts = self._count_all() if recover else self._check_summary()
+                if self._counts.total() > self._most_records:
+                    raise DamageError(f"it has {self._counts.total():,} messages, more than so few bytes can hold")
                 self.metadata = {record.name: record.metadata for record in self._parsed_metadata()}
         except BaseException:
             self._file.close()
@@ -132,6 +136,13 @@ class McapReader(LogReader):
             raise LogReadError(self.path, f"damaged: {what}", RECOVER_HINT)
         if what not in self.lost:
             self.lost.append(what)
+
+    def _check_size(self, limit: int) -> None:
+        """Check how much all chunks claim to unpack to. Raises DamageError."""
+        size = sum(block.head.size for block in self._survey.blocks if block.head and block.head.compression)
+        if size > limit:
+            claim = f"unpacked, its chunks would be of {megabytes(size)}"
+            raise DamageError(f"{claim}, more than {megabytes(limit)}, which is the most for a file of this size")
 
     def _check_summary(self) -> Counter[int]:
         """Check the summary against the file, and return the number of messages by channel. Raises DamageError."""
@@ -234,13 +245,13 @@ class McapReader(LogReader):
 
     def _split(self, block: Block, wanted: Container[int]) -> Contents:
         """Read and split a block. Raises DamageError."""
-        return split(self._data(block), wanted, block.head and block.head.packed_size)
+        return split(self._data(block), wanted, self._most_records)
 
     def _contents(self, block: Block, wanted: Mapping[int, str] | range) -> tuple[bytes, Contents] | None:
         """Read, split and check a block; None, and a loss, where it is damaged. Raises LogReadError."""
         try:
             data = self._data(block)
-            contents = split(data, wanted, block.head and block.head.packed_size)
+            contents = split(data, wanted, self._most_records)
             self._check(block, contents, wanted)
         except (DamageError, OSError) as error:
             self._lose(_damaged_block(block, error))

@@ -48,12 +48,6 @@ FIRST_PRIVATE_OPCODE = 0x80
 MAX_COMPRESSION_NAME = 16
 """The name of a compression is no longer (bytes)."""
 
-FREE_RECORDS, LEAST_RECORD = 4096, 4
-"""A chunk has at most so many records, and one more for each so many bytes of what it is packed into.
-
-Log times, numbers and stamps differ from message to message, and take more than that however well they are packed.
-"""
-
 KNOWN_OPCODES = frozenset(int(opcode) for opcode in Opcode)
 
 
@@ -282,13 +276,13 @@ class Contents:
     last_time: int = 0
 
 
-def split(data: bytes, wanted: Container[int], packed_size: int | None = None) -> Contents:
+def split(data: bytes, wanted: Container[int], most: int) -> Contents:
     """Split the records of a chunk.
 
     Args:
         data: The records.
         wanted: The channels whose messages are wanted.
-        packed_size: Their size when they were packed (bytes); None where they were not.
+        most: A log of its size has no more records.
 
     Returns:
         What there is.
@@ -299,7 +293,6 @@ def split(data: bytes, wanted: Container[int], packed_size: int | None = None) -
     contents = Contents()
     counts, rows = contents.counts, contents.rows
     first, last = None, 0
-    most = FREE_RECORDS + (len(data) if packed_size is None else packed_size) // LEAST_RECORD
     for opcode, start, stop in _records(data, most):
         if opcode == Opcode.MESSAGE:
             if stop - start < MESSAGE.size:
