@@ -156,7 +156,9 @@ def _listed_files(folder: Path) -> list[Path]:
         return []  # without it, the files are found by their names
     if len(names) > MAX_FILES:
         raise LogReadError(path, f"a list of {len(names)} files, more than {MAX_FILES}")
-    if not all(Path(name).name and len(name.encode()) <= MAX_NAME and "\0" not in name for name in names):
+    if not all(
+        Path(name).name not in ("", "..") and len(name.encode()) <= MAX_NAME and "\0" not in name for name in names
+    ):
         return []
     return list(dict.fromkeys(_present(folder / Path(name).name) for name in names))
 
