@@ -48,6 +48,9 @@ FIXED: Mapping[str, tuple[Attribute, ...]] = {
 """The values that attributes may have where others would change shapes, or are not needed."""
 
 
+FAR = 2.0**31
+"""Range's bounds are nearer to zero than this, so that numbers of all types are exact in double precision."""
+
 NARROW_FILTERS, NARROW_WORK = 8, 4
 """A multiply-add of a convolution with fewer filters in a group than this takes as long as this many others."""
 
@@ -390,16 +393,18 @@ def _range(call: Call) -> Outcome:
     start, limit, delta = (call.known(i) for i in range(3))
     if any(part.size != 1 or part.dtype != start.dtype for part in (start, limit, delta)):
         raise call.fail("has bounds that are no single numbers")
-    with np.errstate(all="ignore"):
-        steps = _steps(start, limit, delta)
+    steps = _steps(start, limit, delta)
     if not math.isfinite(steps):
         raise call.fail("has bounds or a step without meaning")
     return Outcome((Value(_sizes(call, [math.ceil(steps)]), start.dtype),))
 
 
-def _steps(start: Array, limit: Array, delta: Array) -> float:
-    """Return how many steps lead from start to limit, in the precision of the bounds as ONNX Runtime does."""
-    return float(((limit - start) / delta).item())
+def _steps(*bounds: Array) -> float:
+    """Return how many steps lead from start to limit, in double precision as ONNX Runtime does; NaN: too many."""
+    start, limit, delta = (float(bound.item()) for bound in bounds)
+    if delta == 0 or not max(abs(start), abs(limit)) < FAR:
+        return math.nan
+    return (limit - start) / delta
 
 
 def _reshape(call: Call) -> Outcome:

@@ -126,6 +126,7 @@ CASES: list[Case] = [
     ([node("Shape", "images", "s", start=1, end=-1), node("Cast", "s", to=1)], {}),
     (node("Range", "a b c"), {"a": np.full((), 7, np.float32), "b": np.array(-1, "f4"), "c": np.array(-0.7, "f4")}),
     (node("Range", "a b c"), {"a": np.full((), 0.3, np.float32), "b": np.array(17, "f4"), "c": np.array(0.1, "f4")}),
+    (node("Range", "a b c"), {"a": np.full((), 0, np.float32), "b": np.array(0.3, "f4"), "c": np.array(0.1, "f4")}),
     ([node("Range", "a b c", "r"), node("Cast", "r", to=1)], {"a": np.array(-3), "b": np.array(8), "c": np.array(3)}),
     (node("Reshape", "images s"), {"s": integers(0, -1, 7, 4)}),
     ([node("Unsqueeze", "images a", "u"), node("Squeeze", "u b")], {"a": integers(0, -1), "b": integers(0)}),
