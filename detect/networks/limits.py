@@ -15,7 +15,7 @@ class NetworkLimits:
 
     For comparison: the shipped YOLO's batch of eight tiles takes work of 6e9 multiply-adds, and its tensors 0.2 GB in
     all, 19 MB at a time; a YOLOv5s' batch, or its image of 640 x 640 pixels, 17e9, 0.4 GB, 39 MB. Two cores do such
-    work in less than a second, and 40e9 of the slowest operators' in about ten.
+    work in less than a second, and as much as is allowed, of the slowest operators, in about five.
     """
 
     max_file_bytes: int = 48 << 20

@@ -105,11 +105,11 @@ class _Inference:
             if name and value is None:
                 raise GraphError(f"its {shown(node.operator)} takes {shown(name)}, which no node before it gives")
         call = Call(node.operator, self._network.opset, inputs, node.attributes, len(node.outputs))
-        outcome = infer(call, self._limits.max_known)
+        inferred = infer(call, self._limits.max_known)
         costs, limits = self._costs, self._limits
-        costs.multiply_adds += outcome.work
+        costs.multiply_adds += inferred.work
         _check("multiply-adds", costs.multiply_adds, limits.max_multiply_adds)
-        for name, value in zip(node.outputs, outcome.values, strict=True):
+        for name, value in zip(node.outputs, inferred.values, strict=True):
             self._keep(name, value)
         costs.live_bytes = max(costs.live_bytes, self._live)
         _check("bytes in use at a time", costs.live_bytes, limits.max_live_bytes)

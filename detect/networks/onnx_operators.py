@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import reduce
 
 import numpy as np
@@ -47,6 +47,9 @@ FIXED: Mapping[str, tuple[Attribute, ...]] = {
 }
 """The values that attributes may have where others would change shapes, or are not needed."""
 
+
+FAR = 2.0**31
+"""Range's bounds are nearer to zero than this, so that numbers of all types are exact in double precision."""
 
 NARROW_FILTERS, NARROW_WORK = 8, 4
 """A multiply-add of a convolution with fewer filters in a group than this takes as long as this many others."""
@@ -206,7 +209,7 @@ class Call:
 
 
 @dataclass(frozen=True)
-class Outcome:
+class Inferred:
     """What a node gives and takes.
 
     Attributes:
@@ -218,7 +221,7 @@ class Outcome:
     work: float = 0.0
 
 
-Infer = Callable[[Call], Outcome]
+Infer = Callable[[Call], Inferred]
 Compute = Callable[[Call, Sequence[Array]], Array]
 
 
@@ -243,12 +246,12 @@ class Operator:
     max_outputs: int = 1
 
 
-def infer(call: Call, max_known: int) -> Outcome:
+def infer(call: Call, max_known: int) -> Inferred:
     """Infer what a node gives.
 
     Args:
         call: The node.
-        max_known: Outputs of at most this many elements are computed where all inputs are known.
+        max_known: The elements of outputs of at most this many are computed where all inputs are known.
 
     Returns:
         Its outputs and its work.
@@ -260,15 +263,19 @@ def infer(call: Call, max_known: int) -> Outcome:
     if operator is None:
         raise GraphError(f"it has the operator {shown(call.operator)}, which is not run: detectors do without it")
     _check_form(call, operator)
-    outcome = operator.infer(call)
+    inferred = operator.infer(call)
     given = [value for value in call.inputs if value is not None]
     is_constant = all(value.is_constant for value in given)
-    values = [Value(value.shape, value.dtype, value.data, is_constant) for value in outcome.values]
+    values = [
+        replace(value, data=value.data if value.elements <= max_known else None, is_constant=is_constant)
+        for value in inferred.values
+    ]
     known = [value.data for value in given if value.data is not None]
-    if operator.compute and len(known) == len(given) and values[0].elements <= max_known and values[0].data is None:
+    is_small = values[0].elements <= max_known and values[0].data is None
+    if operator.compute and is_small and len(known) == len(given):
         values[0] = _computed(call, operator.compute, known, values[0])
     elements = sum(value.elements for value in (*given, *values))
-    return Outcome(tuple(values), outcome.work + operator.element_work * elements)
+    return Inferred(tuple(values), inferred.work + operator.element_work * elements)
 
 
 def _check_form(call: Call, operator: Operator) -> None:
@@ -315,63 +322,63 @@ def broadcast(call: Call, *shapes: Shape) -> Shape:
     return tuple(result)
 
 
-def _same(call: Call) -> Outcome:
+def _same(call: Call) -> Inferred:
     """Give the shape and the type of the first input; the others are broadcast to it."""
     first = call.value(0)
     shapes = [value.shape for value in call.inputs if value is not None]
     if broadcast(call, *shapes) != first.shape:
         raise call.fail(f"has inputs of shapes that do not fit together: {shown(shapes)}")
-    return Outcome((Value(first.shape, first.dtype),))
+    return Inferred((Value(first.shape, first.dtype),))
 
 
-def _axis_checked(call: Call) -> Outcome:
+def _axis_checked(call: Call) -> Inferred:
     first = call.value(0)
     call.axis(call.integer("axis", -1 if call.opset >= 13 else 1), len(first.shape))
-    return Outcome((Value(first.shape, first.dtype),))
+    return Inferred((Value(first.shape, first.dtype),))
 
 
-def _clip(call: Call) -> Outcome:
+def _clip(call: Call) -> Inferred:
     if any(value is not None and value.elements != 1 for value in call.inputs[1:]):
         raise call.fail("has bounds that are no single numbers")
     first = call.value(0)
-    return Outcome((Value(first.shape, first.dtype),))
+    return Inferred((Value(first.shape, first.dtype),))
 
 
 def _broadcasting(dtype: DType | None = None) -> Infer:
-    def infer_broadcast(call: Call) -> Outcome:
+    def infer_broadcast(call: Call) -> Inferred:
         values = [call.value(i) for i in range(len(call.inputs))]
         chosen = values[1].dtype if call.operator == "Where" else values[0].dtype
-        return Outcome((Value(broadcast(call, *(value.shape for value in values)), dtype or chosen),))
+        return Inferred((Value(broadcast(call, *(value.shape for value in values)), dtype or chosen),))
 
     return infer_broadcast
 
 
-def _division(call: Call) -> Outcome:
+def _division(call: Call) -> Inferred:
     """Divide: integers by known positive ones alone, as others end a process or depend on the image."""
     if call.value(1).dtype.kind != "f" and not (call.known(1) > 0).all():
         raise call.fail("divides by an integer that is not positive")
     return _broadcasting()(call)
 
 
-def _cast(call: Call) -> Outcome:
+def _cast(call: Call) -> Inferred:
     number = call.integer("to", 0)
     if number not in DTYPES:
         raise call.fail(f"casts to type {number} of ONNX, which is not run")
-    return Outcome((Value(call.value(0).shape, DTYPES[number]),))
+    return Inferred((Value(call.value(0).shape, DTYPES[number]),))
 
 
-def _constant(call: Call) -> Outcome:
+def _constant(call: Call) -> Inferred:
     data = call.attributes.get("value")
     if not isinstance(data, np.ndarray):
         raise call.fail("has no array")
-    return Outcome((Value(data.shape, data.dtype, data),))
+    return Inferred((Value(data.shape, data.dtype, data),))
 
 
-def _constant_of_shape(call: Call) -> Outcome:
+def _constant_of_shape(call: Call) -> Inferred:
     fill = call.attributes.get("value", np.zeros(1, np.float32))
     if not isinstance(fill, np.ndarray) or fill.size != 1:
         raise call.fail("has a value that is no single number")
-    return Outcome((Value(_sizes(call, call.known_integers(0)), fill.dtype),))
+    return Inferred((Value(_sizes(call, call.known_integers(0)), fill.dtype),))
 
 
 def _sizes(call: Call, sizes: Sequence[int]) -> Shape:
@@ -380,29 +387,31 @@ def _sizes(call: Call, sizes: Sequence[int]) -> Shape:
     return tuple(sizes)
 
 
-def _shape(call: Call) -> Outcome:
+def _shape(call: Call) -> Inferred:
     shape = call.value(0).shape
     part = shape[slice(call.integer("start", 0), call.integer("end", len(shape)))]
-    return Outcome((Value((len(part),), np.dtype(np.int64), np.array(part, np.int64)),))
+    return Inferred((Value((len(part),), np.dtype(np.int64), np.array(part, np.int64)),))
 
 
-def _range(call: Call) -> Outcome:
+def _range(call: Call) -> Inferred:
     start, limit, delta = (call.known(i) for i in range(3))
     if any(part.size != 1 or part.dtype != start.dtype for part in (start, limit, delta)):
         raise call.fail("has bounds that are no single numbers")
-    with np.errstate(all="ignore"):
-        steps = _steps(start, limit, delta)
+    steps = _steps(start, limit, delta)
     if not math.isfinite(steps):
         raise call.fail("has bounds or a step without meaning")
-    return Outcome((Value(_sizes(call, [math.ceil(steps)]), start.dtype),))
+    return Inferred((Value(_sizes(call, [math.ceil(steps)]), start.dtype),))
 
 
-def _steps(start: Array, limit: Array, delta: Array) -> float:
-    """Return how many steps lead from start to limit, in the precision of the bounds as ONNX Runtime does."""
-    return float(((limit - start) / delta).item())
+def _steps(*bounds: Array) -> float:
+    """Return how many steps lead from start to limit, in double precision as ONNX Runtime does; NaN: too many."""
+    start, limit, delta = (float(bound.item()) for bound in bounds)
+    if delta == 0 or not max(abs(start), abs(limit)) < FAR:
+        return math.nan
+    return (limit - start) / delta
 
 
-def _reshape(call: Call) -> Outcome:
+def _reshape(call: Call) -> Inferred:
     value, wanted = call.value(0), list(call.known_integers(1))
     for i, size in enumerate(wanted):
         if size == 0:
@@ -412,28 +421,28 @@ def _reshape(call: Call) -> Outcome:
         wanted[wanted.index(-1)] = value.elements // rest if rest > 0 else 0
     if math.prod(_sizes(call, wanted)) != value.elements:
         raise call.fail(f"makes {shown(tuple(wanted))} of {shown(value.shape)}")
-    return Outcome((Value(tuple(wanted), value.dtype),))
+    return Inferred((Value(tuple(wanted), value.dtype),))
 
 
-def _flatten(call: Call) -> Outcome:
+def _flatten(call: Call) -> Inferred:
     value = call.value(0)
     rank = len(value.shape)
     axis = call.integer("axis", 1)
     axis = rank if axis == rank else call.axis(axis, rank)
-    return Outcome((Value((math.prod(value.shape[:axis]), math.prod(value.shape[axis:])), value.dtype),))
+    return Inferred((Value((math.prod(value.shape[:axis]), math.prod(value.shape[axis:])), value.dtype),))
 
 
-def _squeeze(call: Call) -> Outcome:
+def _squeeze(call: Call) -> Inferred:
     value = call.value(0)
     axes = call.axes(len(value.shape), call.opset >= AXES_AS_INPUT["Squeeze"])
     if axes is None:
         axes = tuple(i for i, size in enumerate(value.shape) if size == 1)
     if any(value.shape[axis] != 1 for axis in axes):
         raise call.fail(f"squeezes {shown(value.shape)} along {shown(axes)}")
-    return Outcome((Value(tuple(size for i, size in enumerate(value.shape) if i not in axes), value.dtype),))
+    return Inferred((Value(tuple(size for i, size in enumerate(value.shape) if i not in axes), value.dtype),))
 
 
-def _unsqueeze(call: Call) -> Outcome:
+def _unsqueeze(call: Call) -> Inferred:
     value = call.value(0)
     as_input = call.opset >= AXES_AS_INPUT["Unsqueeze"]
     count = len(call.known_integers(1) if as_input else call.integers("axes", ()))
@@ -441,18 +450,18 @@ def _unsqueeze(call: Call) -> Outcome:
     sizes = list(value.shape)
     for axis in axes:
         sizes.insert(axis, 1)
-    return Outcome((Value(tuple(sizes), value.dtype),))
+    return Inferred((Value(tuple(sizes), value.dtype),))
 
 
-def _transpose(call: Call) -> Outcome:
+def _transpose(call: Call) -> Inferred:
     value = call.value(0)
     order = call.integers("perm", range(len(value.shape))[::-1])
     if sorted(order) != list(range(len(value.shape))):
         raise call.fail(f"orders the axes of {shown(value.shape)} as {shown(order)}")
-    return Outcome((Value(tuple(value.shape[axis] for axis in order), value.dtype),))
+    return Inferred((Value(tuple(value.shape[axis] for axis in order), value.dtype),))
 
 
-def _concat(call: Call) -> Outcome:
+def _concat(call: Call) -> Inferred:
     values = [call.value(i) for i in range(len(call.inputs))]
     first = values[0].shape
     axis = call.axis(call.integer("axis", 0), len(first))
@@ -460,10 +469,10 @@ def _concat(call: Call) -> Outcome:
     if len(rests) > 1 or any(len(value.shape) != len(first) for value in values):
         raise call.fail("has inputs of shapes that do not fit together")
     size = sum(value.shape[axis] for value in values)
-    return Outcome((Value((*first[:axis], size, *first[axis + 1 :]), values[0].dtype),))
+    return Inferred((Value((*first[:axis], size, *first[axis + 1 :]), values[0].dtype),))
 
 
-def _split(call: Call) -> Outcome:
+def _split(call: Call) -> Inferred:
     value = call.value(0)
     axis = call.axis(call.integer("axis", 0), len(value.shape))
     size, parts = value.shape[axis], call.outputs
@@ -477,7 +486,9 @@ def _split(call: Call) -> Outcome:
         sizes = (*(largest,) * (parts - 1), size - largest * (parts - 1))
     if len(sizes) != parts or call.integer("num_outputs", parts) != parts or sum(_sizes(call, sizes)) != size:
         raise call.fail(f"makes parts of {shown(sizes)} of {size}")
-    return Outcome(tuple(Value((*value.shape[:axis], part, *value.shape[axis + 1 :]), value.dtype) for part in sizes))
+    return Inferred(
+        tuple(Value((*value.shape[:axis], part, *value.shape[axis + 1 :]), value.dtype) for part in sizes)
+    )
 
 
 def _slices(call: Call) -> tuple[slice, ...]:
@@ -495,13 +506,13 @@ def _slices(call: Call) -> tuple[slice, ...]:
     return tuple(found)
 
 
-def _slice(call: Call) -> Outcome:
+def _slice(call: Call) -> Inferred:
     value = call.value(0)
     sizes = [len(range(*part.indices(size))) for part, size in zip(_slices(call), value.shape, strict=True)]
-    return Outcome((Value(tuple(sizes), value.dtype),))
+    return Inferred((Value(tuple(sizes), value.dtype),))
 
 
-def _gather(call: Call) -> Outcome:
+def _gather(call: Call) -> Inferred:
     value, indices = call.value(0), call.value(1)
     axis = call.axis(call.integer("axis", 0), len(value.shape))
     if indices.dtype.kind != "i":
@@ -509,22 +520,22 @@ def _gather(call: Call) -> Outcome:
     if indices.data is not None:
         for index in indices.data.ravel().tolist():
             call.axis(index, value.shape[axis])
-    return Outcome((Value((*value.shape[:axis], *indices.shape, *value.shape[axis + 1 :]), value.dtype),))
+    return Inferred((Value((*value.shape[:axis], *indices.shape, *value.shape[axis + 1 :]), value.dtype),))
 
 
-def _expand(call: Call) -> Outcome:
+def _expand(call: Call) -> Inferred:
     value = call.value(0)
-    return Outcome((Value(broadcast(call, value.shape, _sizes(call, call.known_integers(1))), value.dtype),))
+    return Inferred((Value(broadcast(call, value.shape, _sizes(call, call.known_integers(1))), value.dtype),))
 
 
-def _tile(call: Call) -> Outcome:
+def _tile(call: Call) -> Inferred:
     value, repeats = call.value(0), _sizes(call, call.known_integers(1))
     if len(repeats) != len(value.shape):
         raise call.fail(f"repeats {shown(value.shape)} by {shown(repeats)}")
-    return Outcome((Value(tuple(a * b for a, b in zip(value.shape, repeats, strict=True)), value.dtype),))
+    return Inferred((Value(tuple(a * b for a, b in zip(value.shape, repeats, strict=True)), value.dtype),))
 
 
-def _pad(call: Call) -> Outcome:
+def _pad(call: Call) -> Inferred:
     value, pads = call.value(0), call.known_integers(1)
     rank = len(value.shape)
     is_reflected = call.attributes.get("mode") == b"reflect"
@@ -532,10 +543,10 @@ def _pad(call: Call) -> Outcome:
         raise call.fail(f"pads {shown(value.shape)} by {shown(pads)}")
     if is_reflected and any(pad >= value.shape[i % rank] for i, pad in enumerate(pads)):
         raise call.fail(f"reflects {shown(value.shape)} by {shown(pads)}")
-    return Outcome((Value(tuple(s + pads[i] + pads[i + rank] for i, s in enumerate(value.shape)), value.dtype),))
+    return Inferred((Value(tuple(s + pads[i] + pads[i + rank] for i, s in enumerate(value.shape)), value.dtype),))
 
 
-def _resize(call: Call) -> Outcome:
+def _resize(call: Call) -> Inferred:
     value, scales, sizes = call.value(0), call.optional(2), call.optional(3)
     if scales is not None and scales.elements:
         factors = call.known(2).astype(np.float32)
@@ -551,7 +562,7 @@ def _resize(call: Call) -> Outcome:
     if len(resized) != len(value.shape):
         raise call.fail("does not say to which size")
     shape = _sizes(call, resized)
-    return Outcome((Value(shape, value.dtype),), 8.0 * math.prod(shape))
+    return Inferred((Value(shape, value.dtype),), 8.0 * math.prod(shape))
 
 
 @dataclass(frozen=True)
@@ -594,7 +605,7 @@ def _check_bias(call: Call, filters: int) -> None:
         raise call.fail(f"has a bias of shape {shown(bias.shape)} for {filters} filters")
 
 
-def _conv(call: Call) -> Outcome:
+def _conv(call: Call) -> Inferred:
     value, weight = call.value(0), call.value(1)
     group = call.integer("group", 1)
     if len(value.shape) < 3 or len(weight.shape) != len(value.shape) or group < 1:
@@ -608,21 +619,21 @@ def _conv(call: Call) -> Outcome:
     size = depth * math.prod(window.kernel)
     narrow = filters // group < NARROW_FILTERS
     work = math.prod(shape) * size * (NARROW_WORK if narrow else 1) + value.shape[0] * group * CALL_WORK
-    return Outcome((Value(shape, value.dtype),), work)
+    return Inferred((Value(shape, value.dtype),), work)
 
 
-def _pool(call: Call) -> Outcome:
+def _pool(call: Call) -> Inferred:
     value = call.value(0)
     if len(value.shape) < 3:
         raise call.fail(f"takes an image of shape {shown(value.shape)}")
     window = _Window.of(call, call.integers("kernel_shape", ()))
     shape = (*value.shape[:2], *window.outputs(call, value.shape[2:]))
-    return Outcome((Value(shape, value.dtype),), POOLING_WORK * math.prod(shape) * math.prod(window.kernel))
+    return Inferred((Value(shape, value.dtype),), POOLING_WORK * math.prod(shape) * math.prod(window.kernel))
 
 
-def _global_pool(call: Call) -> Outcome:
+def _global_pool(call: Call) -> Inferred:
     value = call.value(0)
-    return Outcome((Value((*value.shape[:2], *(1 for _ in value.shape[2:])), value.dtype),))
+    return Inferred((Value((*value.shape[:2], *(1 for _ in value.shape[2:])), value.dtype),))
 
 
 def _check_floats(call: Call, *values: Value) -> None:
@@ -630,7 +641,7 @@ def _check_floats(call: Call, *values: Value) -> None:
         raise call.fail("multiplies matrices of integers, which takes long")
 
 
-def _matmul(call: Call) -> Outcome:
+def _matmul(call: Call) -> Inferred:
     value, other = call.value(0), call.value(1)
     _check_floats(call, value, other)
     if not value.shape or not other.shape:
@@ -643,10 +654,10 @@ def _matmul(call: Call) -> Outcome:
     rows = left[-2:-1] if len(value.shape) > 1 else ()
     cols = right[-1:] if len(other.shape) > 1 else ()
     shape = (*batch, *rows, *cols)
-    return Outcome((Value(shape, value.dtype),), _product_work(math.prod(batch), left[-2], left[-1], right[-1]))
+    return Inferred((Value(shape, value.dtype),), _product_work(math.prod(batch), left[-2], left[-1], right[-1]))
 
 
-def _gemm(call: Call) -> Outcome:
+def _gemm(call: Call) -> Inferred:
     value, other, added = call.value(0), call.value(1), call.optional(2)
     _check_floats(call, value, other)
     if len(value.shape) != 2 or len(other.shape) != 2:
@@ -656,7 +667,7 @@ def _gemm(call: Call) -> Outcome:
     shape = (left[0], right[1])
     if left[1] != right[0] or (added is not None and broadcast(call, added.shape, shape) != shape):
         raise call.fail(f"multiplies {shown(value.shape)} by {shown(other.shape)}")
-    return Outcome((Value(shape, value.dtype),), _product_work(1, left[0], left[1], right[1]))
+    return Inferred((Value(shape, value.dtype),), _product_work(1, left[0], left[1], right[1]))
 
 
 def _product_work(batch: int, rows: int, inner: int, cols: int) -> float:
@@ -664,14 +675,14 @@ def _product_work(batch: int, rows: int, inner: int, cols: int) -> float:
     return batch * (rows * inner * cols + CALL_WORK)
 
 
-def _reduce(call: Call) -> Outcome:
+def _reduce(call: Call) -> Inferred:
     value = call.value(0)
     rank = len(value.shape)
     as_input = call.opset >= AXES_AS_INPUT.get(call.operator, REDUCTION_AXES_AS_INPUT)
     axes = call.axes(rank, as_input) or tuple(range(rank))
     kept = call.integer("keepdims", 1)
     sizes = [1 if i in axes else size for i, size in enumerate(value.shape) if kept or i not in axes]
-    return Outcome((Value(tuple(sizes), value.dtype),))
+    return Inferred((Value(tuple(sizes), value.dtype),))
 
 
 def _quotient(call: Call, arrays: Sequence[Array]) -> Array:
@@ -711,12 +722,12 @@ def _elementwise(function: Callable[..., Array]) -> Compute:
     return lambda call, arrays: function(*arrays)
 
 
-def _vectors(call: Call) -> Outcome:
+def _vectors(call: Call) -> Inferred:
     """Give the shape of the first input; the others have a number for each channel."""
     first = call.value(0)
     if any(value is None or value.shape != first.shape[1:2] for value in call.inputs[1:]):
         raise call.fail("has inputs of shapes that do not fit together")
-    return Outcome((Value(first.shape, first.dtype),))
+    return Inferred((Value(first.shape, first.dtype),))
 
 
 def _of(

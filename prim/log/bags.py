@@ -230,9 +230,7 @@ class BagReader(LogReader):
         """Note a connection, which the index has too. Raises ValueError."""
         number, connection = connection_of(record)
         if self._connections.setdefault(number, connection) != connection:
-            raise ValueError(
-                f"connection {number} is {connection.topic}, elsewhere {self._connections[number].topic}"
-            )
+            raise ValueError(f"connection {number} is another one elsewhere")
 
     def _check_connection(self, message: StoredMessage) -> None:
         if message.connection not in self._connections:

@@ -179,8 +179,9 @@ class LogFile:
     def _hint(self, layers: list[str], options: str = "") -> str:
         """Return what to do where the file cannot be unpacked here."""
         quoted = shlex.quote(str(self.path))
-        first, *others = (f"{name} -dc{options if name == 'zstd' else ''}" for name in layers)
-        return f"unpack it with: {' | '.join((f'{first} {quoted}', *others))} > {quoted}.unpacked"
+        others = "".join(f" | {name} -dc{options if name == 'zstd' else ''}" for name in layers[1:])
+        options = options if layers[0] == "zstd" else ""
+        return f"unpack it with: {layers[0]} -dc{options} {quoted}{others} > {quoted}.unpacked"
 
 
 def _compression(head: bytes) -> tuple[str, Callable[[IO[bytes]], Iterator[bytes]]] | None:

@@ -149,7 +149,7 @@ def _listed_files(folder: Path) -> list[Path]:
         return []  # without it, the files are found by their names
     if len(names) > MAX_FILES:
         raise LogReadError(path, f"a list of {len(names)} files, more than {MAX_FILES}")
-    if not all(Path(name).name and len(name.encode()) <= MAX_NAME and "\0" not in name for name in names):
+    if not all(map(_is_file_name, names)):
         return []
     return list(dict.fromkeys(_present(folder / Path(name).name) for name in names))
 
@@ -178,6 +178,10 @@ def _listed_names(path: Path, text: str) -> list[str]:
     if not isinstance(node.value, list) or not all(getattr(item, "tag", "") == STRING_TAG for item in node.value):
         return []
     return [str(item.value) for item in node.value]
+
+
+def _is_file_name(name: str) -> bool:
+    return Path(name).name not in ("", "..") and len(name.encode()) <= MAX_NAME and "\0" not in name
 
 
 def _present(file: Path) -> Path:

@@ -387,7 +387,7 @@ SITUATIONS = {
         packed(lambda a, b: b.write_bytes(lzma.compress(a.read_bytes()))), "unpack it with: xz -dc", tool
     ),
     "lz4": Situation(packed(pack_lz4), "unpack it with: lz4 -dc", tool),
-    "five times gzip": Situation(packed(pack_five_times), "unpack it with: {} -dc {} >", tool),
+    "five times gzip": Situation(packed(pack_five_times), "unpack it with: {} -dc", tool),
     "two scanners": Situation(only(topics=TWO), "choose one with --scan-topic"),
     "a topic with a space": Situation(only(topics=SPACE), "choose one with --scan-topic"),
     "joined scanners": Situation(only(topics=JOINED), "for one of them give --scan-topic", code=0),

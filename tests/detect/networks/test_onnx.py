@@ -126,6 +126,7 @@ CASES: list[Case] = [
     ([node("Shape", "images", "s", start=1, end=-1), node("Cast", "s", to=1)], {}),
     (node("Range", "a b c"), {"a": np.full((), 7, np.float32), "b": np.array(-1, "f4"), "c": np.array(-0.7, "f4")}),
     (node("Range", "a b c"), {"a": np.full((), 0.3, np.float32), "b": np.array(17, "f4"), "c": np.array(0.1, "f4")}),
+    (node("Range", "a b c"), {"a": np.full((), 0, np.float32), "b": np.array(0.3, "f4"), "c": np.array(0.1, "f4")}),
     ([node("Range", "a b c", "r"), node("Cast", "r", to=1)], {"a": np.array(-3), "b": np.array(8), "c": np.array(3)}),
     (node("Reshape", "images s"), {"s": integers(0, -1, 7, 4)}),
     ([node("Unsqueeze", "images a", "u"), node("Squeeze", "u b")], {"a": integers(0, -1), "b": integers(0)}),
@@ -211,6 +212,10 @@ def test_operators_of_older_sets_take_axes_as_attributes() -> None:
         ([node("Gather", "images i", axis=1)], {"i": integers(3)}, "its Gather has an axis 3 of 3"),
         ([node("Slice", "images a a a a")], {"a": integers(0)}, "bounds that do not fit"),
         ([node("Cast", "seen", to=8)], {}, "casts to type 8"),
+        ([node("Constant", "", "s", value=np.ones(5000, np.int64)), node("Expand", "seen s")], {}, "too many numbers"),
+        ([node("Expand", "seen s")], {"s": np.ones(5000, np.int64)}, "too many numbers"),
+        ([node("Gemm", "i i", "q"), node("Cast", "q", to=1)], {"i": np.ones((2, 2), np.int64)}, "matrices of integers"),
+        ([node("ReduceMean", "images", keepdims=2)], {}, "attribute keepdims of a value"),
     ],
 )  # fmt: skip
 def test_what_is_not_run_is_named(
