@@ -33,8 +33,8 @@ LONGEST = 200_000
 """Of an input (bytes)."""
 SHARES = {"logs": 5, "codecs": 3, "documents": 1, "networks": 1}
 """How the minutes are shared."""
-INSTRUMENTED = ["prim", "detect"]
-"""Packages whose branches guide the search."""
+INSTRUMENTED, KERNELS = ["prim", "detect.networks"], ["prim.compiled", "prim.raycast"]
+"""Packages whose branches guide the search, and modules among them that numba must read as they are."""
 FINDING = "finding: "
 
 
@@ -42,7 +42,7 @@ def _instrumented_targets() -> Any:
     """Import the targets, and all that they call, with branches that report to libFuzzer."""
     import atheris
 
-    with atheris.instrument_imports(include=INSTRUMENTED, enable_loader_override=False):
+    with atheris.instrument_imports(include=INSTRUMENTED, exclude=KERNELS, enable_loader_override=False):
         from bench.fuzzing import targets
     return targets
 
