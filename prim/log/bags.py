@@ -26,7 +26,7 @@ from prim.log.bag_records import (
     unpacked,
 )
 from prim.log.decoding.codecs import SCAN_CONTENTS, content_of
-from prim.log.limits import memory_limit, records_limit, unpacked_limit
+from prim.log.limits import ROW_LIMITS, memory_limit, records_limit, unpacked_limit
 from prim.log.log_file import LogFile
 from prim.log.reader import LogReader, ros2_name
 from prim.log.recovery import RECOVER_HINT
@@ -161,7 +161,7 @@ class BagReader(LogReader):
 
     def _count_record(self) -> None:
         self._records_read += 1
-        limit = records_limit(self.file_bytes)
+        limit = records_limit(self.file_bytes, ROW_LIMITS)
         if self._records_read > limit:
             what = f"more than {limit} records in {self.file_bytes} bytes"
             raise LogReadError(self.path, what, self._unpack_hint)

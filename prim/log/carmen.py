@@ -19,7 +19,7 @@ from prim.errors import LogReadError
 from prim.log.decoding.cdr import SECOND
 from prim.log.decoding.codecs import Codec, Content
 from prim.log.decoding.values import StampedPose, checked_stamp, quaternion
-from prim.log.limits import records_limit
+from prim.log.limits import ROW_LIMITS, records_limit
 from prim.log.log_file import LogFile
 from prim.log.reader import LogReader
 from prim.log.recovery import RECOVER_HINT
@@ -318,7 +318,7 @@ class CarmenReader(LogReader):
 
     def _lines(self) -> Iterator[_Line]:
         """Yield the lines that are no comments. Raises LogReadError where they are damaged, or too many."""
-        count, limit = 0, records_limit(self.file_bytes)
+        count, limit = 0, records_limit(self.file_bytes, ROW_LIMITS)
         sizes: dict[str, int] = {}
         for lines, is_ended in self._blocks():
             count += len(lines)

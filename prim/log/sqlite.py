@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from prim.arrays import Stamps
 from prim.errors import LogReadError
 from prim.log.decoding.codecs import SCAN_CONTENTS, content_of
-from prim.log.limits import memory_limit, records_limit, unpacked_limit
+from prim.log.limits import ROW_LIMITS, memory_limit, records_limit, unpacked_limit
 from prim.log.log_file import LogFile
 from prim.log.reader import LogReader
 from prim.log.recovery import RECOVER_HINT
@@ -183,7 +183,7 @@ class SqliteBagReader(LogReader):
             else:
                 name, kind, encoding = texts
                 topics.append((number, Topic(name, kind, encoding, 0, content_of(kind))))
-            if len(topics) > records_limit(self.file_bytes):
+            if len(topics) > records_limit(self.file_bytes, ROW_LIMITS):
                 raise LogReadError(self.path, f"more than {len(topics)} topics")
         return [topic for _, topic in sorted(topics, key=lambda item: item[0])]
 
@@ -202,7 +202,7 @@ class SqliteBagReader(LogReader):
     def _read_rows(self) -> _Table:
         """Read which messages there are."""
         table = _Table()
-        limit = records_limit(self.file_bytes)
+        limit = records_limit(self.file_bytes, ROW_LIMITS)
         for row, number, time, kind in self._rows("topic_id, timestamp, typeof(data)"):
             if not isinstance(number, int) or number not in self._numbers:
                 self._damage("messages of a topic that is not listed")

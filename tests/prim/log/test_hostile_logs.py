@@ -22,7 +22,7 @@ from bench.fuzzing.formats import (
     message,
 )
 from prim.errors import LogReadError
-from prim.log import limits, log_file, open_log
+from prim.log import bags, log_file, open_log, reader
 from prim.log.limits import memory_limit, records_limit, unpacked_limit
 from prim.log.log_file import LogFile
 from tests import hints
@@ -79,7 +79,7 @@ def test_limits_are_by_the_size_of_the_file_as_the_user_names_it(tmp_path: Path)
 def test_a_bomb_is_refused_with_both_sizes_and_what_unpacks_it(
     tmp_path: Path, compress: Callable[[bytes], bytes], layers: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(limits, "UNPACKED_BASE", 1 << 20)
+    monkeypatch.setattr(log_file, "unpacked_limit", lambda file_bytes: 1 << 20)
     data = bytes(3 << 20)
     for _ in range(layers):
         data = compress(data)
@@ -87,7 +87,7 @@ def test_a_bomb_is_refused_with_both_sizes_and_what_unpacks_it(
     monkeypatch.chdir(tmp_path)
     with pytest.raises(LogReadError) as caught:
         LogFile(path, recover=True)
-    assert f"its {len(data)} bytes unpack to more than {unpacked_limit(len(data))} bytes" in str(caught.value)
+    assert f"its {len(data)} bytes unpack to more than {1 << 20} bytes" in str(caught.value)
     hint = hints.find("if you trust it, unpack it with: ", str(caught.value))
     (unpacked,) = hints.run_in_shell(hint.partition(": ")[2])
     assert unpacked.read_bytes() == bytes(3 << 20)
@@ -112,7 +112,7 @@ def test_very_many_frames_of_nothing_are_nothing(tmp_path: Path, nothing: bytes)
 def test_a_message_that_unpacks_to_much_is_lost(
     tmp_path: Path, claim: bool, what: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(limits, "BASE_BYTES", 1 << 20)
+    monkeypatch.setattr(reader, "memory_limit", lambda file_bytes: 1 << 20)
     bomb = zstandard.ZstdCompressor(write_content_size=claim).compress(bytes(3 << 20))
     path = written(tmp_path, bag([Chunk(SCANS + message(1, bomb), {0: [1]})], [SCANS]))
     count, lost, number = read(path, recover=True)
@@ -191,7 +191,7 @@ def test_a_bag_of_many_chunks_that_each_unpack_to_much_is_refused(tmp_path: Path
 def test_a_bag_of_more_records_than_its_bytes_can_hold_is_refused(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(limits, "RECORDS_BASE", 1000)
+    monkeypatch.setattr(bags, "records_limit", lambda file_bytes, limits: 1000)
     many = Chunk(SCANS + message(1, b"") * 9000, {0: [1] * 9000}, b"bz2")
     with pytest.raises(LogReadError, match=r"more than \d+ records"):
         open_log(written(tmp_path, bag([many], [SCANS])), recover=True)
