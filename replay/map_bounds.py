@@ -13,7 +13,7 @@ A map of the end points must not be at the mercy of a few of them. Two things ma
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -38,7 +38,7 @@ WORLD_MARGIN = 0.1
 
 @dataclass(frozen=True)
 class MapBoundsOptions:
-    """How the bounds of a map follow from end points; set by hand, the last five on simulated logs.
+    """How the bounds of a map follow from end points; set by hand, those of noise on simulated logs.
 
     Attributes:
         sampled_scans: The bulk of the end points is that of at least half as many scans, evenly spread.
@@ -52,6 +52,10 @@ class MapBoundsOptions:
             coarse map has told from which cells they are.
         passes: The coarse map is made anew within its own bounds at most so often.
         margin: The map then reaches so many of its cells beyond them.
+        sampled_rays: A coarse map is made of about so many rays.
+        least_gain: Its bounds are taken where they leave out at least this share of the area.
+        free_cells: However few rays a log has, its map may have so many cells.
+        cells_per_ray: And so many for each ray: more of them are seen by none.
     """
 
     sampled_scans: int = 400
@@ -63,6 +67,10 @@ class MapBoundsOptions:
     noise_tail_share: float = 0.0025
     passes: int = 4
     margin: int = 5
+    sampled_rays: int = 100_000
+    least_gain: float = 0.1
+    free_cells: int = 30_000_000
+    cells_per_ray: int = 1000
 
 
 OPTIONS = MapBoundsOptions()
@@ -103,6 +111,15 @@ def choose_map_bounds(
     """
     if replay.bounds is not None:
         return MapBounds(GridFrame.covering(replay.bounds, replay.resolution))
+    found = _found_bounds(posed_scans, replay, world, options)
+    _check_size(found.frame, posed_scans.scan_log.expected_rays, options)
+    return found
+
+
+def _found_bounds(
+    posed_scans: PosedScans, replay: ReplayOptions, world: World | None, options: MapBoundsOptions
+) -> MapBounds:
+    """Return the bounds of the recorded world, else of the end points. Raises LogReadError, MapSizeError."""
     if world is not None:
         return MapBounds(grid_frame_of_world(world, replay.resolution))
     sample = _Sample(options.sampled_scans, replay.resolution)
@@ -119,14 +136,26 @@ def choose_map_bounds(
         what = f"{outside} end points and poses are far from all others, and lie outside {{}}"
         notes.append(_note(what, bounds, extent, replay.resolution))
     noise = sample.noise()
-    if 3 * noise > options.blurred_extent * min(bounds[2] - bounds[0], bounds[3] - bounds[1]):
-        bounds = _without_noise(sample, bounds, noise, replay.resolution, options)
+    sharp = _without_noise(sample, bounds, noise, replay.resolution, options)
+    if _area(sharp) < (1 - options.least_gain) * _area(bounds):
+        bounds = sharp
         share = float(np.mean(~_inside(points, bounds)))
         what = (
             f"noise of about {noise:.2g} m carries {share:.0%} of the end points beyond {{}}, which hold what it hit"
         )
         notes.append(_note(what, bounds, extent, replay.resolution))
     return MapBounds(GridFrame.covering(bounds, replay.resolution), tuple(notes))
+
+
+def _check_size(frame: GridFrame, rays: int, options: MapBoundsOptions) -> None:
+    """Check that a map has no more cells than its rays can see. Raises MapSizeError."""
+    cells, most = frame.rows * frame.cols, max(options.free_cells, options.cells_per_ray * rays)
+    if cells > most:
+        x0, y0, x1, y1 = frame.bounds
+        size = (
+            f"a map of {x1 - x0:.0f} x {y1 - y0:.0f} m has {cells / 1e6:.0f} million cells of {frame.resolution:g} m"
+        )
+        raise MapSizeError(f"{size}, far more than {rays:,} rays can see", frame.resolution, cells / most)
 
 
 def grid_frame_of_world(world: World, resolution: float) -> GridFrame:
@@ -202,6 +231,16 @@ class _Sample:
         """Return the positions (N, 2) of the sensor in m."""
         return np.array([(pose.x, pose.y) for _, pose in self.pieces])
 
+    def thinned(self, rays: int) -> list[tuple[Scan, Pose2D]]:
+        """Return the pieces with every n-th beam alone, so that about so many rays are left."""
+        step = -(-sum(len(scan.ranges) for scan, _ in self.pieces) // rays)
+        if step == 1:
+            return list(self.pieces)
+        return [
+            (replace(scan, ranges=scan.ranges[::step], angle_increment=step * scan.angle_increment), pose)
+            for scan, pose in self.pieces
+        ]
+
     def longest_range(self) -> float:
         """Return the longest range (m) that the scanners can measure."""
         return max(scan.range_max for scan, _ in self.pieces)
@@ -231,6 +270,15 @@ def _extent(points: FloatArray) -> Bounds:
     """Return the extent of points (N, 2)."""
     (x0, y0), (x1, y1) = points.min(axis=0).tolist(), points.max(axis=0).tolist()
     return x0, y0, x1, y1
+
+
+def _area(bounds: Bounds) -> float:
+    return (bounds[2] - bounds[0]) * (bounds[3] - bounds[1])
+
+
+def _is_blurred(bounds: Bounds, noise: float, options: MapBoundsOptions) -> bool:
+    """Return whether noise (m) matters within bounds."""
+    return 3 * noise > options.blurred_extent * min(bounds[2] - bounds[0], bounds[3] - bounds[1])
 
 
 def _union(a: Bounds, b: Bounds) -> Bounds:
@@ -272,15 +320,22 @@ def _without_noise(
     """Return the bounds of the cells that end points are from, by coarse forward maps, and of the sensor.
 
     Each map within smaller bounds tells more of them from their noise, since beams that end outside leave no cells
-    there to explain them.
+    there to explain them. Bounds that are not blurred stay as they are: by the noise as neighbouring beams show it,
+    and by that of the map.
     """
+    if not _is_blurred(bounds, noise, options):
+        return bounds
+    pieces = sample.thinned(options.sampled_rays)
     longest = max(bounds[2] - bounds[0], bounds[3] - bounds[1])
     cell = max(noise / options.cells_per_std, longest / MAX_COARSE_CELLS, resolution)
     for _ in range(options.passes):
         mapper = ForwardMapper(cell, bounds)
-        for scan, pose in sample.pieces:
+        for scan, pose in pieces:
             mapper.accumulate(scan, pose)
-        before, bounds = bounds, _bounds_of_hits(mapper.fit(), options.noise_tail_share)
+        fit = mapper.fit()
+        if not _is_blurred(bounds, mapper.noise_std or 0.0, options):
+            return bounds
+        before, bounds = bounds, _bounds_of_hits(fit, options.noise_tail_share)
         if bounds == before:
             break
     margin, positions = options.margin * resolution, sample.positions()

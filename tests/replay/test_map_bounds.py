@@ -12,6 +12,7 @@ from typing import Any, cast
 import numpy as np
 import pytest
 
+from mapping.grid import MapSizeError
 from mapping.kernels import MAX_STEPS
 from prim.errors import LogReadError
 from prim.scan import PosedScan, Scan
@@ -38,7 +39,7 @@ def chosen(scans: Sequence[tuple[Scan, Pose2D]], **options: Any) -> MapBounds:
     posed = [PosedScan(k, scan, pose, ((scan, pose),)) for k, (scan, pose) in enumerate(scans)]
 
     class Source(list[PosedScan]):
-        scan_log = SimpleNamespace(path=Path("a.mcap"))
+        scan_log = SimpleNamespace(path=Path("a.mcap"), expected_rays=sum(len(scan.ranges) for scan, _ in scans))
 
     return choose_map_bounds(cast(PosedScans, Source(posed)), ReplayOptions(**options), None)
 
@@ -108,6 +109,15 @@ def test_without_end_points_the_map_is_what_is_free_around_the_sensor() -> None:
         scan = replace(scan, range_max=longest, ranges=np.full(BEAMS, far, dtype=np.float32))
         frame, _ = chosen([(scan, pose)])
         assert frame.bounds == pytest.approx((-reach, -reach, reach, reach), abs=0.011)
+
+
+def test_a_map_that_its_rays_cannot_see_is_refused() -> None:
+    """The bounds that make it can still be given."""
+    scan, pose = scan_at(0.0, 0.0)
+    scan.ranges[:] = 100.0
+    with pytest.raises(MapSizeError, match=r"200 x 200 m has 400 million cells|far more than 360 rays can see"):
+        chosen([(scan, pose)])
+    assert chosen([(scan, pose)], bounds=(-60.0, -60.0, 60.0, 60.0)).frame.rows == 12_000
 
 
 def test_bounds_that_are_given_or_recorded_are_kept() -> None:

@@ -107,8 +107,8 @@ class McapReader(LogReader):
             except (DamageError, OSError) as error:
                 self._lose(f"its attachment at byte {record.at}: {error}")
                 continue
-            if found.name == name and not crc_fits:
-                self._lose(f"the CRC of its attachment {name} does not fit")
+            if not crc_fits:  # its name, too, may be what is damaged
+                self._lose(f"the CRC of its attachment {found.name} does not fit")
             elif found.name == name:
                 return found.data
         return None
