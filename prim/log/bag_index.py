@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from prim.log.bag_records import MAGIC, BagRecords, Op, Record, fields_of
+from prim.log.bag_records import MAGIC, BagRecord, BagRecords, Op, fields_of
 from prim.log.decoding.cdr import SECOND
 
 _COUNT = struct.Struct("<II")
@@ -95,7 +95,7 @@ class BagIndex:
             raise ValueError(f"{counts} connections and chunks are {(len(self.connections), len(self.chunks))}")
         self.at, self._is_whole = start, True
 
-    def _add(self, record: Record) -> None:
+    def _add(self, record: BagRecord) -> None:
         """Add a record of the index. Raises ValueError."""
         if record.op == Op.CONNECTION:
             number, connection = connection_of(record)
@@ -151,7 +151,7 @@ class BagIndex:
         if times and not index.start <= first <= last <= index.end:
             raise ValueError("messages of other times than the index says")
 
-    def check_times(self, record: Record) -> None:
+    def check_times(self, record: BagRecord) -> None:
         """Compare an index behind a chunk, of the messages of a connection, with those. Raises ValueError."""
         if self._times is None:
             return
@@ -176,7 +176,7 @@ class BagIndex:
             self._damage(f"{len(missing)} chunks of the index are not there, the first one at byte {min(missing)}")
 
 
-def connection_of(record: Record) -> tuple[int, Connection]:
+def connection_of(record: BagRecord) -> tuple[int, Connection]:
     """Return the number of the connection that a record describes, and the connection. Raises ValueError."""
     described = fields_of(record.data)
     if b"topic" not in record.fields or b"type" not in described:

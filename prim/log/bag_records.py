@@ -40,7 +40,7 @@ class Op(IntEnum):
     CONNECTION = 7
 
 
-class Record(NamedTuple):
+class BagRecord(NamedTuple):
     """A record of a bag.
 
     Attributes:
@@ -107,7 +107,7 @@ class BagRecords:
         self._stream = stream
         self.size = stream.seek(0, os.SEEK_END)
 
-    def record(self, at: int, limit: int) -> Record:
+    def record(self, at: int, limit: int) -> BagRecord:
         """Read the record at a byte of the file; a chunk that is cut as far as it goes.
 
         Args:
@@ -134,7 +134,7 @@ class BagRecords:
             raise ValueError("a record runs past the end")
         if end - start > limit:
             raise ValueError(f"a record of {end - start} bytes")
-        return Record(op, fields, self._stream.read(min(end, self.size) - start), start, end)
+        return BagRecord(op, fields, self._stream.read(min(end, self.size) - start), start, end)
 
     def next_chunk(self, at: int) -> int:
         """Search for the next chunk from a byte of the file on; where there is none, return the file's end."""
@@ -205,12 +205,12 @@ def time_of(data: bytes) -> int:
     return int(seconds) * SECOND + int(nanoseconds)
 
 
-def message_of(record: Record) -> StoredMessage:
+def message_of(record: BagRecord) -> StoredMessage:
     """Return where the message of a record is. Raises ValueError."""
     return StoredMessage(record.number(b"conn"), record.time(b"time"), record.at, len(record.data))
 
 
-def records_of_chunk(data: bytes) -> Iterator[StoredMessage | Record]:
+def records_of_chunk(data: bytes) -> Iterator[StoredMessage | BagRecord]:
     """Yield the records of a chunk, as far as they are there.
 
     Args:
@@ -242,7 +242,7 @@ def records_of_chunk(data: bytes) -> Iterator[StoredMessage | Record]:
         yield StoredMessage(int.from_bytes(connection, "little"), time_of(time), start, size)
 
 
-def _record_of_chunk(data: bytes, at: int) -> Record:
+def _record_of_chunk(data: bytes, at: int) -> BagRecord:
     start = at + _LENGTH.size
     if start + _LENGTH.size > len(data):
         raise ValueError("it ends within a record")
@@ -253,7 +253,7 @@ def _record_of_chunk(data: bytes, at: int) -> Record:
     if end > len(data):
         raise ValueError("it ends within a record")
     fields = fields_of(data[start:at_size])
-    return Record(_op(fields), fields, data[at_size + _LENGTH.size : end], at_size + _LENGTH.size, end)
+    return BagRecord(_op(fields), fields, data[at_size + _LENGTH.size : end], at_size + _LENGTH.size, end)
 
 
 def unpacked(compression: bytes, data: bytes, size: int) -> tuple[bytes, str]:

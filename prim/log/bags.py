@@ -17,9 +17,9 @@ from prim.errors import LogReadError
 from prim.log.bag_index import BagIndex, Connection, connection_of
 from prim.log.bag_records import (
     MAGIC,
+    BagRecord,
     BagRecords,
     Op,
-    Record,
     StoredMessage,
     message_of,
     records_of_chunk,
@@ -166,7 +166,7 @@ class BagReader(LogReader):
             what = f"more than {limit} records in {self.file_bytes} bytes"
             raise LogReadError(self.path, what, self._unpack_hint)
 
-    def _read_record(self, record: Record, at: int) -> None:
+    def _read_record(self, record: BagRecord, at: int) -> None:
         """Read a record of the file that begins at this byte. Raises ValueError."""
         if record.op == Op.CHUNK:
             self._read_chunk(record, at)
@@ -182,7 +182,7 @@ class BagReader(LogReader):
         elif record.op not in (Op.BAG, Op.CHUNK_INFO):
             raise ValueError(f"a record of an unknown kind, {record.op}")
 
-    def _read_chunk(self, record: Record, at: int) -> None:
+    def _read_chunk(self, record: BagRecord, at: int) -> None:
         """Read the records of a chunk. Raises ValueError."""
         self._index.begin_chunk(at)
         times: dict[int, list[int]] = {}
@@ -202,7 +202,7 @@ class BagReader(LogReader):
             raise ValueError(problem)
         self._index.check_chunk(times)
 
-    def _unpack(self, record: Record) -> tuple[bytes, str]:
+    def _unpack(self, record: BagRecord) -> tuple[bytes, str]:
         """Return the records of a chunk, and what is wrong with it. Raises ValueError."""
         compression, size = record.fields.get(b"compression", b""), record.number(b"size")
         limit = memory_limit(self.file_bytes)
@@ -226,7 +226,7 @@ class BagReader(LogReader):
         self._unpacked.write(data)
         return -1 - at
 
-    def _connect(self, record: Record) -> None:
+    def _connect(self, record: BagRecord) -> None:
         """Note a connection, which the index has too. Raises ValueError."""
         number, connection = connection_of(record)
         if self._connections.setdefault(number, connection) != connection:
