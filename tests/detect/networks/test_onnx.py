@@ -212,9 +212,11 @@ def test_operators_of_older_sets_take_axes_as_attributes() -> None:
         ([node("Gather", "images i", axis=1)], {"i": integers(3)}, "its Gather has an axis 3 of 3"),
         ([node("Slice", "images a a a a")], {"a": integers(0)}, "bounds that do not fit"),
         ([node("Cast", "seen", to=8)], {}, "casts to type 8"),
-        ([node("Constant", "", "s", value=np.ones(5000, np.int64)), node("Expand", "seen s")], {}, "too many numbers"),
+        ([node("Constant", "", "s", value=np.ones(5000, np.int64)), node("Expand", "seen s")], {},
+         "too many numbers"),
         ([node("Expand", "seen s")], {"s": np.ones(5000, np.int64)}, "too many numbers"),
-        ([node("Gemm", "i i", "q"), node("Cast", "q", to=1)], {"i": np.ones((2, 2), np.int64)}, "matrices of integers"),
+        ([node("Gemm", "i i", "q"), node("Cast", "q", to=1)], {"i": np.ones((2, 2), np.int64)},
+         "matrices of integers"),
         ([node("ReduceMean", "images", keepdims=2)], {}, "attribute keepdims of a value"),
     ],
 )  # fmt: skip
