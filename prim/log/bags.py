@@ -81,7 +81,7 @@ class BagReader(LogReader):
 
     Args:
         file: The file.
-        recover: Pass over what is damaged, with or without an index; messages are then read as they were written.
+        recover: Pass over what is damaged, with or without an index.
 
     Raises:
         LogReadError: The file cannot be read, or (unless ``recover``) is damaged or does not agree with its index.
@@ -268,8 +268,8 @@ class BagReader(LogReader):
         return by_time
 
     def messages(self, *topics: str) -> Iterator[Message]:
-        """See :meth:`prim.log.source.LogSource.messages`; a log that is recovered is read in the order of writing."""
-        as_written = self._recover or len(self._shifts) > 1
+        """See :meth:`prim.log.source.LogSource.messages`."""
+        as_written = len(self._shifts) > 1
         stored = self._stored_messages(self._written(topics) if as_written else self._sorted(topics))
         return moved_behind_resets(stored, self._shifts) if as_written else stored
 
@@ -285,6 +285,6 @@ class BagReader(LogReader):
 
     def log_times(self, topic: str) -> Stamps:
         """See :meth:`prim.log.reader.LogReader.log_times`: without reading the messages."""
-        if self._recover or len(self._shifts) > 1:
+        if len(self._shifts) > 1:
             return super().log_times(topic)
         return self._table.times[self._sorted((topic,))]
