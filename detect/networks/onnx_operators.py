@@ -128,7 +128,7 @@ class Call:
         """Return the elements of an input that sizes depend on."""
         data = self.value(i).data
         if data is None:
-            raise self.fail("has a size that depends on the image, or that too many numbers give")
+            raise self.fail("has a size that depends on the image, or on too many numbers")
         return data
 
     def known_integers(self, i: int) -> Shape:
