@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapping.forward.mapper import ForwardFit, ForwardMapper
-from mapping.grid import GridFrame, MapSizeError
+from mapping.grid import MAX_CELLS, GridFrame, MapSizeError
 from mapping.kernels import MAX_STEPS, scan_extent
 from mapping.range_noise import neighbour_noise
 from prim.arrays import FloatArray
@@ -111,17 +111,9 @@ def choose_map_bounds(
     """
     if replay.bounds is not None:
         return MapBounds(GridFrame.covering(replay.bounds, replay.resolution))
-    found = _found_bounds(posed_scans, replay, world, options)
-    _check_size(found.frame, posed_scans.scan_log.expected_rays, options)
-    return found
-
-
-def _found_bounds(
-    posed_scans: PosedScans, replay: ReplayOptions, world: World | None, options: MapBoundsOptions
-) -> MapBounds:
-    """Return the bounds of the recorded world, else of the end points. Raises LogReadError, MapSizeError."""
+    rays = posed_scans.scan_log.expected_rays
     if world is not None:
-        return MapBounds(grid_frame_of_world(world, replay.resolution))
+        return MapBounds(_frame(_bounds_of_world(world), replay.resolution, rays, options))
     sample = _Sample(options.sampled_scans, replay.resolution)
     extent = sample.extent_of_all(posed_scans)
     if extent is None:
@@ -144,18 +136,17 @@ def _found_bounds(
             f"noise of about {noise:.2g} m carries {share:.0%} of the end points beyond {{}}, which hold what it hit"
         )
         notes.append(_note(what, bounds, extent, replay.resolution))
-    return MapBounds(GridFrame.covering(bounds, replay.resolution), tuple(notes))
+    return MapBounds(_frame(bounds, replay.resolution, rays, options), tuple(notes))
 
 
-def _check_size(frame: GridFrame, rays: int, options: MapBoundsOptions) -> None:
-    """Check that a map has no more cells than its rays can see. Raises MapSizeError."""
-    cells, most = frame.rows * frame.cols, max(options.free_cells, options.cells_per_ray * rays)
-    if cells > most:
-        x0, y0, x1, y1 = frame.bounds
-        size = (
-            f"a map of {x1 - x0:.0f} x {y1 - y0:.0f} m has {cells / 1e6:.0f} million cells of {frame.resolution:g} m"
-        )
-        raise MapSizeError(f"{size}, far more than {rays:,} rays can see", frame.resolution, cells / most)
+def _frame(bounds: Bounds, resolution: float, rays: int, options: MapBoundsOptions) -> GridFrame:
+    """Return the grid that covers bounds. Raises MapSizeError where it has far more cells than its rays can see."""
+    width, height = bounds[2] - bounds[0], bounds[3] - bounds[1]
+    cells, most = width * height / resolution**2, max(options.free_cells, options.cells_per_ray * rays)
+    if cells > most and most < MAX_CELLS:
+        what = f"a map of {width:.0f} x {height:.0f} m has {cells / 1e6:.0f} million cells of {resolution:g} m"
+        raise MapSizeError(f"{what}, far more than {rays:,} rays can see", resolution, cells / most)
+    return GridFrame.covering(bounds, resolution)
 
 
 def grid_frame_of_world(world: World, resolution: float) -> GridFrame:
@@ -168,9 +159,12 @@ def grid_frame_of_world(world: World, resolution: float) -> GridFrame:
     Returns:
         The smallest grid of whole cells that covers the world and a margin of WORLD_MARGIN.
     """
+    return GridFrame.covering(_bounds_of_world(world), resolution)
+
+
+def _bounds_of_world(world: World) -> Bounds:
     x0, y0, x1, y1 = world.bounds
-    m = WORLD_MARGIN
-    return GridFrame.covering((x0 - m, y0 - m, x1 + m, y1 + m), resolution)
+    return x0 - WORLD_MARGIN, y0 - WORLD_MARGIN, x1 + WORLD_MARGIN, y1 + WORLD_MARGIN
 
 
 def extent_of_scans(scans: Iterable[tuple[Scan, Pose2D]], resolution: float) -> Bounds | None:

@@ -291,9 +291,14 @@ def earlier_file() -> list[str]:
 
 
 def noisy() -> list[str]:
-    """Ranges with more noise than a room of 2 m has room for."""
-    ranges = 1.0 + 0.3 * np.random.default_rng(1).standard_normal(90).astype(np.float32)
-    return [write("a.mcap", Topics(scan=replace(SCAN, ranges=ranges)))]
+    """Ranges with more noise than a round room of 2 m has room for."""
+    rng = np.random.default_rng(1)
+    with LogWriter(Path("a.mcap")) as log:
+        log.add_topic("/scan", SCAN_TYPE)
+        for second in range(1, 31):
+            ranges = (1.0 + 0.3 * rng.standard_normal(90)).astype(np.float32)
+            log.write("/scan", second * SECOND, encode_scan(replace(SCAN, stamp=second * SECOND, ranges=ranges)))
+    return ["a.mcap", "--standing-still"]
 
 
 FEW = Topics(scan=replace(SCAN, ranges=SCAN.ranges[:3]))
