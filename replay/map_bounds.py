@@ -61,11 +61,11 @@ class MapBoundsOptions:
     sampled_scans: int = 400
     tail_share: float = 0.05
     fence: float = 2.0
-    free_margin: int = 500
+    free_margin: int = 200
     blurred_extent: float = 0.1
-    cells_per_std: float = 10.0
+    cells_per_std: float = 15.0
     noise_tail_share: float = 0.0025
-    passes: int = 4
+    passes: int = 6
     margin: int = 5
     sampled_rays: int = 100_000
     least_gain: float = 0.1
