@@ -47,6 +47,7 @@ class LogReader(ABC):
         self.metadata: Mapping[str, Mapping[str, str]] = {}
         self._recover = recover
         self._undecodable: set[tuple[str, int]] = set()
+        self._undecodable_topics: set[str] = set()
 
     def __enter__(self) -> Self:
         return self
@@ -152,8 +153,9 @@ class LogReader(ABC):
         if not self._recover:
             what = f"message {number} of {topic} cannot be decoded: {reason}"
             raise LogReadError(self.path, what, "pass over such messages with --recover")
-        if not any(name == topic for name, _ in self._undecodable):
-            self.lost.append(f"messages of {topic} that cannot be decoded, the first one {number}: {reason}")
+        if topic not in self._undecodable_topics:
+            self._undecodable_topics.add(topic)
+            self._lose(f"messages of {topic} that cannot be decoded, the first one {number}: {reason}")
         self._undecodable.add((topic, number))
 
 

@@ -33,15 +33,12 @@ from prim.log.mcap.records import (
     unpack_chunk,
 )
 from prim.log.mcap.survey import Block, Survey, Surveyor
-from prim.log.reader import LogReader, ros2_name
+from prim.log.reader import MAX_LOST, LogReader, ros2_name
 from prim.log.recovery import RECOVER_HINT
 from prim.log.source import Message, Topic
 from prim.log.time_resets import LATEST, as_stamps, find_shifts, moved_behind_resets, reset_notes
 
 ALL_CHANNELS = range(1 << 16)
-
-MAX_LOSSES = 20
-"""So many places of damage are named."""
 
 
 class McapReader(LogReader):
@@ -81,6 +78,9 @@ class McapReader(LogReader):
             self._file.close()
             raise
         self.topics = self._read_topics()
+        self._channels: dict[str, list[int]] = {}
+        for channel in self._definitions.channels.values():
+            self._channels.setdefault(channel.topic, []).append(channel.id)
         with damage_refused(self.path):
             self._shifts = self._find_shifts()
         self.notes = reset_notes(self._shifts)
@@ -105,17 +105,17 @@ class McapReader(LogReader):
             try:
                 found, crc_fits = self._read_attachment(record)
             except (DamageError, OSError) as error:
-                self._lose(f"its attachment at byte {record.at}: {error}")
+                self._damage(f"its attachment at byte {record.at}: {error}")
                 continue
             if not crc_fits:  # its name, too, may be what is damaged
-                self._lose(f"the CRC of its attachment {found.name} does not fit")
+                self._damage(f"the CRC of its attachment {found.name} does not fit")
             elif found.name == name:
                 return found.data
         return None
 
     def messages(self, *topics: str) -> Iterator[Message]:
         """See :meth:`prim.log.source.LogSource.messages`."""
-        names = {c.id: c.topic for c in self._definitions.channels.values() if c.topic in topics}
+        names = {channel: topic for topic in topics for channel in self._channels.get(topic, ())}
         if len(self._shifts) > 1:
             yield from moved_behind_resets(self._written(names), self._shifts)
         else:
@@ -125,17 +125,16 @@ class McapReader(LogReader):
         """See :meth:`prim.log.reader.LogReader.log_times`: by the index where there is one."""
         if len(self._shifts) > 1:
             return super().log_times(topic)
-        channels = [channel.id for channel in self._definitions.channels.values() if channel.topic == topic]
         with damage_refused(self.path):
+            channels = self._channels.get(topic, ())
             times = np.concatenate([np.zeros(0, np.int64), *map(self._written_times, channels)])
         return np.sort(times)
 
-    def _lose(self, what: str) -> None:
+    def _damage(self, what: str) -> None:
         """Note a loss; unless recovering, raise LogReadError."""
         if not self._recover:
             raise LogReadError(self.path, f"damaged: {what}", RECOVER_HINT)
-        if what not in self.lost:
-            self.lost.append(what)
+        self._lose(what)
 
     def _check_size(self, limit: int) -> None:
         """Check how much all chunks claim to unpack to. Raises DamageError."""
@@ -199,8 +198,8 @@ class McapReader(LogReader):
                 not self._survey.summary.crc_fits
             ):  # else it shows in them that messages are missing
                 self.lost += [*self._survey.contradictions(), *_miscounted(self._survey, counts)]
-            if len(self.lost) > MAX_LOSSES:
-                self.lost[MAX_LOSSES:] = [f"and at {len(self.lost) - MAX_LOSSES} more places"]
+            if len(self.lost) > MAX_LOST:
+                self.lost[MAX_LOST:] = ["and more"]
         self._survey.blocks = readable
         return counts
 
@@ -214,11 +213,11 @@ class McapReader(LogReader):
         unknown = counts.keys() - self._definitions.channels.keys()
         if unknown:
             messages = sum(counts[channel] for channel in unknown)
-            self._lose(f"{messages} messages of {len(unknown)} channels that it does not describe")
+            self._damage(f"{messages} messages of {len(unknown)} channels that it does not describe")
 
     def _check_definition(self, contradiction: str | None, where: str) -> None:
         if contradiction:
-            self._lose(f"{where} contradicts what came before: {contradiction}")
+            self._damage(f"{where} contradicts what came before: {contradiction}")
 
     def _define(self, block: Block, contents: Contents) -> None:
         """Note what a block defines. Raises DamageError."""
@@ -252,14 +251,15 @@ class McapReader(LogReader):
         try:
             data = self._data(block)
             contents = split(data, wanted, self._most_records)
-            self._check(block, contents, wanted)
+            self._check(block, contents)
         except (DamageError, OSError) as error:
-            self._lose(_damaged_block(block, error))
+            self._damage(_damaged_block(block, error))
             return None
         self._define(block, contents)
+        block.counts = contents.counts
         return data, contents
 
-    def _check(self, block: Block, contents: Contents, wanted: Mapping[int, str] | range) -> None:
+    def _check(self, block: Block, contents: Contents) -> None:
         """Compare what a chunk holds with what it and its index say. Raises DamageError."""
         if block.head is None or self._recover:
             return
@@ -268,13 +268,14 @@ class McapReader(LogReader):
             raise DamageError("its messages are not of the times that it says")
         if not block.index:
             return
-        if contents.counts != block.known_counts:
+        if contents.counts != block.indexed_counts:
             raise DamageError("its index counts other messages than it holds")
-        for channel in block.index:
-            if channel in wanted:
-                rows = [(r[0], r[1] - MESSAGE.size - PREFIX.size) for r in contents.rows if r[3] == channel]
-                if not np.array_equal(self._index_entries(block, channel), np.array(rows, np.uint64)):
-                    raise DamageError(f"its index of channel {channel} is of other messages than it holds")
+        entries: dict[int, list[tuple[int, int]]] = {}
+        for time, start, _, channel in contents.rows:
+            entries.setdefault(channel, []).append((time, start - MESSAGE.size - PREFIX.size))
+        for channel, found in entries.items():
+            if not np.array_equal(self._index_entries(block, channel), np.array(found, np.uint64)):
+                raise DamageError(f"its index of channel {channel} is of other messages than it holds")
 
     def _index_entries(self, block: Block, channel: int) -> np.ndarray[tuple[int, int], np.dtype[np.uint64]]:
         """Return the entries (N, 2) of the index of a channel's messages in a chunk: log time (ns), offset."""
@@ -284,8 +285,11 @@ class McapReader(LogReader):
         return entries[np.argsort(entries[:, 1], kind="stable")]
 
     def _may_hold(self, block: Block, names: Mapping[int, str]) -> bool:
-        """Return whether a block may hold messages of channels: an index that the summary confirms rules that out."""
-        if block.head is not None and (not block.index or not self._survey.summary.chunks or self._recover):
+        """Return whether a block may hold messages of channels.
+
+        What it holds was seen, or an index says it that the summary confirms.
+        """
+        if block.counts is None and (not block.index or not self._survey.summary.chunks or self._recover):
             return True
         return not names.keys().isdisjoint(block.known_counts or ())
 
@@ -345,7 +349,7 @@ class McapReader(LogReader):
         for block in self._survey.blocks:
             if channel in block.index:
                 yield from self._index_entries(block, channel)[:, 0].tolist()
-            elif block.head is None and channel in block.counts:
+            elif block.head is None and channel in (block.counts or ()):
                 contents = self._split(block, (channel,))
                 yield from (row[0] for row in contents.rows)
 
@@ -354,7 +358,7 @@ class McapReader(LogReader):
             try:
                 yield parse(Metadata, read_body(self._file, record))
             except DamageError as error:
-                self._lose(f"its metadata at byte {record.at}: {error}")
+                self._damage(f"its metadata at byte {record.at}: {error}")
 
     def _read_attachment(self, record: Record) -> tuple[Attachment, bool]:
         """Return an attachment, and whether its CRC holds or there is none. Raises DamageError."""

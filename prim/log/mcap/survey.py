@@ -87,7 +87,7 @@ class Block:
         start_time: The first log time (ns): as the chunk says, or as it is in a run.
         end_time: The last one.
         index: A chunk's index of messages by channel; empty where it has none.
-        counts: The number of messages of a run by channel.
+        counts: The number of messages by channel as they were found, of a chunk when it was read; None before.
     """
 
     at: int
@@ -96,7 +96,7 @@ class Block:
     start_time: int
     end_time: int
     index: dict[int, IndexRecord] = field(default_factory=dict)
-    counts: Counter[int] = field(default_factory=Counter)
+    counts: dict[int, int] | None = None
 
     @property
     def what(self) -> str:
@@ -106,9 +106,12 @@ class Block:
     @property
     def known_counts(self) -> dict[int, int] | None:
         """The number of messages by channel; None where only the chunk's content shows it."""
-        if self.head is None:
-            return self.counts
-        return {channel: record.messages for channel, record in self.index.items()} if self.index else None
+        return self.counts if self.counts is not None else self.indexed_counts or None
+
+    @property
+    def indexed_counts(self) -> dict[int, int]:
+        """The number of messages by channel as its index says."""
+        return {channel: record.messages for channel, record in self.index.items()}
 
 
 @dataclass
@@ -318,16 +321,17 @@ class Surveyor:
         self._check_section(record, "a message")
         run = self._last
         if run is None or run.head is not None or run.end != record.at or run.end - run.at > RUN_BYTES:
-            run = Block(record.at, record.at, None, 0, 0)
+            run = Block(record.at, record.at, None, 0, 0, counts={})
         if record.opcode == Opcode.MESSAGE:
             self._stream.seek(record.body)
             head = self._stream.read(MESSAGE.size)
             if record.length < MESSAGE.size or len(head) < MESSAGE.size:
                 raise DamageError(f"the message at byte {record.at} has no head")
             channel, _, time, _ = MESSAGE.unpack(head)
-            run.start_time = min(run.start_time, time) if run.counts else time
+            counts = run.counts if run.counts is not None else {}
+            run.start_time = min(run.start_time, time) if counts else time
             run.end_time = max(run.end_time, time)
-            run.counts[channel] += 1
+            counts[channel] = counts.get(channel, 0) + 1
         if run.at == run.end:
             self._found.blocks.append(run)
         run.end, self._last = record.end, run
