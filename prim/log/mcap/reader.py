@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import heapq
+import struct
 from collections import Counter
 from collections.abc import Container, Iterator, Mapping
 from contextlib import contextmanager
@@ -22,8 +23,8 @@ from prim.log.limits import megabytes, memory_limit, records_limit, unpacked_lim
 from prim.log.log_file import LogFile
 from prim.log.mcap.records import (
     INDEX_ENTRY_BYTES,
-    MESSAGE,
-    PREFIX,
+    MESSAGE_BYTES,
+    PREFIX_BYTES,
     Contents,
     DamageError,
     Record,
@@ -32,7 +33,7 @@ from prim.log.mcap.records import (
     split,
     unpack_chunk,
 )
-from prim.log.mcap.survey import Block, Survey, Surveyor
+from prim.log.mcap.survey import Block, IndexRecord, Survey, Surveyor
 from prim.log.reader import MAX_LOST, LogReader, ros2_name
 from prim.log.recovery import RECOVER_HINT
 from prim.log.source import Message, Topic
@@ -270,19 +271,17 @@ class McapReader(LogReader):
             return
         if contents.counts != block.indexed_counts:
             raise DamageError("its index counts other messages than it holds")
-        entries: dict[int, list[tuple[int, int]]] = {}
+        entries: dict[int, list[int]] = {}
         for time, start, _, channel in contents.rows:
-            entries.setdefault(channel, []).append((time, start - MESSAGE.size - PREFIX.size))
+            entries.setdefault(channel, []).extend((time, start - MESSAGE_BYTES - PREFIX_BYTES))
         for channel, found in entries.items():
-            if not np.array_equal(self._index_entries(block, channel), np.array(found, np.uint64)):
+            if not _same_entries(self._index_bytes(block.index[channel]), found):
                 raise DamageError(f"its index of channel {channel} is of other messages than it holds")
 
-    def _index_entries(self, block: Block, channel: int) -> np.ndarray[tuple[int, int], np.dtype[np.uint64]]:
-        """Return the entries (N, 2) of the index of a channel's messages in a chunk: log time (ns), offset."""
-        at, count = block.index[channel]
-        self._file.seek(at)
-        entries = np.frombuffer(self._file.read(count * INDEX_ENTRY_BYTES), "<u8").reshape(-1, 2)
-        return entries[np.argsort(entries[:, 1], kind="stable")]
+    def _index_bytes(self, index: IndexRecord) -> bytes:
+        """Return the entries of an index of messages: log time (ns) and offset of each, 8 bytes little-endian."""
+        self._file.seek(index.entries)
+        return self._file.read(index.messages * INDEX_ENTRY_BYTES)
 
     def _may_hold(self, block: Block, names: Mapping[int, str]) -> bool:
         """Return whether a block may hold messages of channels.
@@ -310,7 +309,10 @@ class McapReader(LogReader):
         blocks.sort(key=attrgetter("start_time", "at"))
         if all(earlier.end_time <= later.start_time for earlier, later in pairwise(blocks)):
             for block in blocks:
-                yield from self._sorted(block, names)
+                if (found := self._contents(block, names)) is not None:
+                    data, contents = found
+                    for time, start, stop, channel in sorted(contents.rows):
+                        yield Message(names[channel], time, data[start:stop])
             return
         waiting: list[tuple[int, int, int, Message]] = []
         held = 0
@@ -342,16 +344,20 @@ class McapReader(LogReader):
     def _written_times(self, channel: int) -> Stamps:
         """Return when the messages of a channel were logged (N,) in ns, in the order of the file."""
         if channel not in self._times:
-            self._times[channel] = as_stamps(() if self._recover else self._indexed_times(channel))
+            parts = () if self._recover else self._indexed_times(channel)
+            self._times[channel] = np.concatenate([np.zeros(0, np.int64), *parts])
         return self._times[channel]
 
-    def _indexed_times(self, channel: int) -> Iterator[int]:
+    def _indexed_times(self, channel: int) -> Iterator[Stamps]:
+        """Yield when the messages of a channel were logged (ns), by the index of chunks, and in runs of records."""
+        indices = [block.index[channel] for block in self._survey.blocks if channel in block.index]
+        entries = np.frombuffer(b"".join(map(self._index_bytes, indices)), "<u8").reshape(-1, 2)
+        chunks = np.repeat(np.arange(len(indices)), [index.messages for index in indices])
+        if len(entries):
+            yield np.minimum(entries[np.lexsort((entries[:, 1], chunks)), 0], LATEST).astype(np.int64)
         for block in self._survey.blocks:
-            if channel in block.index:
-                yield from self._index_entries(block, channel)[:, 0].tolist()
-            elif block.head is None and channel in (block.counts or ()):
-                contents = self._split(block, (channel,))
-                yield from (row[0] for row in contents.rows)
+            if block.head is None and channel in (block.counts or ()):
+                yield as_stamps(row[0] for row in self._split(block, (channel,)).rows)
 
     def _parsed_metadata(self) -> Iterator[Metadata]:
         for record in self._survey.metadata:
@@ -368,6 +374,15 @@ class McapReader(LogReader):
         attachment.write(builder)
         crc = body[-4:]
         return attachment, crc in (b"\0\0\0\0", builder.end()[-4:])  # type: ignore[no-untyped-call]
+
+
+def _same_entries(index: bytes, found: list[int]) -> bool:
+    """Return whether an index has the entries that were found, in their order or in another."""
+    packed = struct.pack(f"<{len(found)}Q", *found)
+    if index == packed:
+        return True
+    entries, others = (np.frombuffer(data, "<u8").reshape(-1, 2) for data in (index, packed))
+    return np.array_equal(entries[np.argsort(entries[:, 1], kind="stable")], others)
 
 
 class _Definitions:

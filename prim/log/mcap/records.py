@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import struct
 import zlib
-from collections.abc import Container, Iterator
+from collections.abc import Container
 from dataclasses import dataclass, field
 from io import BytesIO
 from typing import IO, NamedTuple, TypeVar
@@ -17,7 +17,6 @@ from mcap.records import (
     Attachment,
     AttachmentIndex,
     Channel,
-    ChunkIndex,
     Metadata,
     MetadataIndex,
     Schema,
@@ -31,22 +30,39 @@ MAGIC = b"\x89MCAP0\r\n"
 PREFIX = struct.Struct("<BQ")
 """The prefix of every record: opcode and length."""
 
+PREFIX_BYTES = PREFIX.size
+
 MESSAGE = struct.Struct("<HIQQ")
 """The start of a message record: channel, sequence, log time, publish time."""
+
+MESSAGE_BYTES = MESSAGE.size
+
+MESSAGE_OPCODE = int(Opcode.MESSAGE)
+
+NEVER = 1 << 64
+"""Behind all log times."""
 
 _CHUNK = struct.Struct("<QQQII")
 """The start of a chunk record: first and last log time, uncompressed size, CRC, and the length of the next field."""
 
+_CHUNK_INDEX = struct.Struct("<QQQQI")
+"""The start of an entry of the index of chunks: first and last log time, where the chunk begins, its length, and the
+length of where its indices of messages are."""
+_CHUNK_INDEX_ENTRY = struct.Struct("<HQ")
+"""Where one is: channel, byte."""
+
 MESSAGE_INDEX = struct.Struct("<HI")
 """The start of a record that indexes messages: channel, and the length of its entries (log time, offset) in bytes."""
+
+MESSAGE_INDEX_BYTES = MESSAGE_INDEX.size
 
 INDEX_ENTRY_BYTES = 16
 
 FIRST_PRIVATE_OPCODE = 0x80
 """Opcodes from here on are for applications; others that the specification does not name are damage."""
 
-MAX_COMPRESSION_NAME = 16
-"""The name of a compression is no longer (bytes)."""
+HEAD_BYTES = _CHUNK.size + 48 + 8
+"""So much of a record shows what it says of itself: of a chunk with the name of its compression, and its length."""
 
 KNOWN_OPCODES = frozenset(int(opcode) for opcode in Opcode)
 
@@ -62,21 +78,23 @@ class Record(NamedTuple):
         opcode: What it is.
         at: Where its prefix begins (bytes).
         length: The length of what follows the prefix (bytes).
+        head: The first HEAD_BYTES of that, or fewer where the file has no more.
     """
 
     opcode: int
     at: int
     length: int
+    head: bytes
 
     @property
     def body(self) -> int:
         """Where what follows the prefix begins (bytes)."""
-        return self.at + PREFIX.size
+        return self.at + PREFIX_BYTES
 
     @property
     def end(self) -> int:
         """Where the next record begins (bytes)."""
-        return self.at + PREFIX.size + self.length
+        return self.at + PREFIX_BYTES + self.length
 
 
 class ChunkHead(NamedTuple):
@@ -101,7 +119,19 @@ class ChunkHead(NamedTuple):
     packed_size: int
 
 
-Kind = TypeVar("Kind", Attachment, AttachmentIndex, Channel, ChunkIndex, Metadata, MetadataIndex, Schema, Statistics)
+class IndexedChunk(NamedTuple):
+    """What the index of chunks says of one, as far as it is compared.
+
+    Attributes:
+        at: Where it begins (bytes).
+        indices: Where its indices of messages begin, by channel.
+    """
+
+    at: int
+    indices: dict[int, int]
+
+
+Kind = TypeVar("Kind", Attachment, AttachmentIndex, Channel, Metadata, MetadataIndex, Schema, Statistics)
 
 
 def record_at(stream: IO[bytes], at: int, size: int) -> Record:
@@ -119,15 +149,15 @@ def record_at(stream: IO[bytes], at: int, size: int) -> Record:
         DamageError: No record begins there, or it does not end within the file.
     """
     stream.seek(at)
-    head = stream.read(PREFIX.size)
-    if len(head) < PREFIX.size:
+    head = stream.read(PREFIX_BYTES + HEAD_BYTES)
+    if len(head) < PREFIX_BYTES:
         raise DamageError("it ends within a record")
-    opcode, length = PREFIX.unpack(head)
+    opcode, length = PREFIX.unpack_from(head)
     if opcode not in KNOWN_OPCODES and opcode < FIRST_PRIVATE_OPCODE:
         raise DamageError(f"no record begins at byte {at}")
-    if length > size - at - PREFIX.size:
+    if length > size - at - PREFIX_BYTES:
         raise DamageError(f"the record at byte {at} runs past the end")
-    return Record(opcode, at, length)
+    return Record(opcode, at, length, head[PREFIX_BYTES:])
 
 
 def read_body(stream: IO[bytes], record: Record) -> bytes:
@@ -143,6 +173,8 @@ def read_body(stream: IO[bytes], record: Record) -> bytes:
     Raises:
         DamageError: The file ends before.
     """
+    if record.length <= len(record.head):
+        return record.head[: record.length]
     stream.seek(record.body)
     data = stream.read(record.length)
     if len(data) < record.length:
@@ -184,11 +216,10 @@ def parse(kind: type[Kind], body: bytes, fills: bool = False) -> Kind:
     return record
 
 
-def read_chunk_head(stream: IO[bytes], record: Record) -> ChunkHead:
+def read_chunk_head(record: Record) -> ChunkHead:
     """Read what a chunk says of itself.
 
     Args:
-        stream: The file.
         record: The chunk.
 
     Returns:
@@ -197,8 +228,7 @@ def read_chunk_head(stream: IO[bytes], record: Record) -> ChunkHead:
     Raises:
         DamageError: Its lengths do not add up.
     """
-    stream.seek(record.body)
-    head = stream.read(min(record.length, _CHUNK.size + MAX_COMPRESSION_NAME + 8))
+    head = record.head
     try:
         start_time, end_time, size, crc, name_length = _CHUNK.unpack_from(head)
         at = _CHUNK.size + name_length
@@ -209,6 +239,18 @@ def read_chunk_head(stream: IO[bytes], record: Record) -> ChunkHead:
         raise DamageError(f"the lengths of the chunk at byte {record.at} do not add up")
     compression = head[_CHUNK.size : at].decode("ascii", "replace")
     return ChunkHead(start_time, end_time, size, crc, compression, record.body + at + 8, packed_size)
+
+
+def parse_chunk_index(body: bytes) -> IndexedChunk:
+    """Parse an entry of the index of chunks. Raises DamageError."""
+    try:
+        _, _, at, _, size = _CHUNK_INDEX.unpack_from(body)
+        entries = body[_CHUNK_INDEX.size : _CHUNK_INDEX.size + size]
+        _, name_length = struct.unpack_from("<QI", body, _CHUNK_INDEX.size + size)
+        struct.unpack_from("<QQ", body, _CHUNK_INDEX.size + size + 12 + name_length)
+        return IndexedChunk(at, dict(_CHUNK_INDEX_ENTRY.iter_unpack(entries)))
+    except struct.error:
+        raise DamageError("a ChunkIndex that cannot be read") from None
 
 
 def unpack_chunk(stream: IO[bytes], head: ChunkHead, limit: int) -> bytes:
@@ -292,41 +334,35 @@ def split(data: bytes, wanted: Container[int], most: int) -> Contents:
     """
     contents = Contents()
     counts, rows = contents.counts, contents.rows
-    first, last = None, 0
-    for opcode, start, stop in _records(data, most):
-        if opcode == Opcode.MESSAGE:
-            if stop - start < MESSAGE.size:
+    first, last = NEVER, 0
+    at, end, unpack, unpack_message = 0, len(data), PREFIX.unpack_from, MESSAGE.unpack_from
+    while at < end:
+        if end - at < PREFIX_BYTES:
+            raise DamageError("a record runs past its end")
+        opcode, length = unpack(data, at)
+        start = at + PREFIX_BYTES
+        at = start + length
+        most -= 1
+        if at > end or most < 0:
+            raise DamageError(
+                "a record runs past its end" if at > end else "it has more records than so few bytes can hold"
+            )
+        if opcode == MESSAGE_OPCODE:
+            if length < MESSAGE_BYTES:
                 raise DamageError("a message without a head")
-            channel, _, time, _ = MESSAGE.unpack_from(data, start)
+            channel, _, time, _ = unpack_message(data, start)
             counts[channel] = counts.get(channel, 0) + 1
-            if first is None or time < first:
+            if time < first:
                 first = time
             if time > last:
                 last = time
             if channel in wanted:
-                rows.append((time, start + MESSAGE.size, stop, channel))
+                rows.append((time, start + MESSAGE_BYTES, at, channel))
         elif opcode == Opcode.SCHEMA:
-            contents.schemas.append(data[start:stop])
+            contents.schemas.append(data[start:at])
         elif opcode == Opcode.CHANNEL:
-            contents.channels.append(data[start:stop])
+            contents.channels.append(data[start:at])
         elif opcode < FIRST_PRIVATE_OPCODE:
             raise DamageError(f"a record that belongs in no chunk (opcode {opcode})")
-    contents.first_time, contents.last_time = first, last
+    contents.first_time, contents.last_time = (first, last) if counts else (None, 0)
     return contents
-
-
-def _records(data: bytes, most: int) -> Iterator[tuple[int, int, int]]:
-    """Yield opcode, start and end of the records in data. Raises DamageError where these do not fit together."""
-    at, end, unpack, prefix = 0, len(data), PREFIX.unpack_from, PREFIX.size
-    while at < end:
-        if most == 0:
-            raise DamageError("it has more records than so few bytes can hold")
-        most -= 1
-        if end - at < prefix:
-            raise DamageError("a record runs past its end")
-        opcode, length = unpack(data, at)
-        start = at + prefix
-        at = start + length
-        if at > end:
-            raise DamageError("a record runs past its end")
-        yield opcode, start, at

@@ -11,18 +11,24 @@ from dataclasses import dataclass, field
 from typing import IO, NamedTuple
 
 from mcap.opcode import Opcode
-from mcap.records import AttachmentIndex, Channel, ChunkIndex, Metadata, MetadataIndex, Schema, Statistics
+from mcap.records import AttachmentIndex, Channel, Metadata, MetadataIndex, Schema, Statistics
 
 from prim.log.mcap.records import (
     INDEX_ENTRY_BYTES,
     MAGIC,
     MESSAGE,
+    MESSAGE_BYTES,
     MESSAGE_INDEX,
+    MESSAGE_INDEX_BYTES,
+    MESSAGE_OPCODE,
     PREFIX,
+    PREFIX_BYTES,
     ChunkHead,
     DamageError,
+    IndexedChunk,
     Record,
     parse,
+    parse_chunk_index,
     read_body,
     read_chunk_head,
     record_at,
@@ -49,12 +55,16 @@ CHAIN = 3
 _START = re.compile(rb"[\x01-\x0f](?=.{4}\x00{4})", re.DOTALL)
 """How a record of less than 4 GB begins."""
 
+_CHUNK_OPCODE, _MESSAGE_INDEX_OPCODE, _CHUNK_INDEX_OPCODE = map(
+    int, (Opcode.CHUNK, Opcode.MESSAGE_INDEX, Opcode.CHUNK_INDEX)
+)
+_RUN_OPCODES = tuple(map(int, (Opcode.MESSAGE, Opcode.SCHEMA, Opcode.CHANNEL)))
+
 _PARSED = {
     int(Opcode.SCHEMA): Schema,
     int(Opcode.CHANNEL): Channel,
     int(Opcode.METADATA): Metadata,
     int(Opcode.STATISTICS): Statistics,
-    int(Opcode.CHUNK_INDEX): ChunkIndex,
     int(Opcode.ATTACHMENT_INDEX): AttachmentIndex,
     int(Opcode.METADATA_INDEX): MetadataIndex,
 }
@@ -68,12 +78,17 @@ class IndexRecord(NamedTuple):
     """The record that indexes a channel's messages in a chunk.
 
     Attributes:
-        at: Where its entries begin (bytes).
+        at: Where it begins (bytes).
         messages: Their number.
     """
 
     at: int
     messages: int
+
+    @property
+    def entries(self) -> int:
+        """Where its entries begin (bytes)."""
+        return self.at + PREFIX_BYTES + MESSAGE_INDEX_BYTES
 
 
 @dataclass(slots=True)
@@ -130,7 +145,7 @@ class Summary:
 
     schemas: list[Schema] = field(default_factory=list)
     channels: list[Channel] = field(default_factory=list)
-    chunks: list[ChunkIndex] = field(default_factory=list)
+    chunks: list[IndexedChunk] = field(default_factory=list)
     attachments: list[AttachmentIndex] = field(default_factory=list)
     metadata: list[MetadataIndex] = field(default_factory=list)
     statistics: Statistics | None = None
@@ -155,25 +170,25 @@ class Survey:
 
     def contradictions(self) -> Iterator[str]:
         """Yield in what the summary contradicts the file, as far as that shows without unpacking chunks."""
-        yield from _compared(
-            "chunk", [b.at for b in self.blocks if b.head], self.summary.chunks, "chunk_start_offset"
-        )
+        yield from _compared("chunk", [b.at for b in self.blocks if b.head], self.summary.chunks, "at")
         yield from _compared("attachment", [r.at for r in self.attachments], self.summary.attachments, "offset")
         yield from _compared("metadata record", [r.at for r in self.metadata], self.summary.metadata, "offset")
         blocks = {block.at: block for block in self.blocks}
         for index in self.summary.chunks:
-            block = blocks.get(index.chunk_start_offset)
-            if block and index.message_index_offsets and not _agree(index, block):
+            block = blocks.get(index.at)
+            if block and index.indices and not _agree(index, block):
                 yield f"the index of chunks names other messages of {block.what} than are there"
 
     def counts(self) -> Counter[int] | None:
         """Return the number of messages by channel; None where only the chunks' contents show it."""
         counts: Counter[int] = Counter()
         for block in self.blocks:
-            known = block.known_counts
-            if known is None:
+            if block.counts is None and not block.index:
                 return None
-            counts.update(known)
+            for channel, count in (block.counts or {}).items():
+                counts[channel] += count
+            for channel, index in block.index.items():
+                counts[channel] += index.messages
         return counts
 
 
@@ -192,11 +207,9 @@ def _compared(what: str, found: Sequence[int], indexed: Sequence[object], name: 
         yield f"its index names the {what} at byte {min(twice)} {named[min(twice)]} times"
 
 
-def _agree(index: ChunkIndex, block: Block) -> bool:
+def _agree(index: IndexedChunk, block: Block) -> bool:
     """Return whether the index of chunks names a chunk's indices of messages: those that are not empty, at least."""
-    starts = {channel: record.at - MESSAGE_INDEX.size - PREFIX.size for channel, record in block.index.items()}
-    named = index.message_index_offsets
-    return starts.items() <= named.items()
+    return all(index.indices.get(channel) == record.at for channel, record in block.index.items())
 
 
 class Surveyor:
@@ -283,26 +296,25 @@ class Surveyor:
     def _take(self, record: Record) -> None:
         """Add a record to what was found. Raises DamageError."""
         opcode = record.opcode
-        if opcode == Opcode.CHUNK:
-            head = read_chunk_head(self._stream, record)
+        if opcode == _MESSAGE_INDEX_OPCODE:
+            self._take_index(record)
+        elif opcode == _CHUNK_OPCODE:
+            head = read_chunk_head(record)
             self._check_section(record, "a chunk")
             self._last = Block(record.at, record.end, head, head.start_time, head.end_time)
             self._found.blocks.append(self._last)
-        elif opcode == Opcode.MESSAGE_INDEX:
-            self._take_index(record)
-        elif opcode in (Opcode.SCHEMA, Opcode.CHANNEL, Opcode.MESSAGE):
+        elif opcode in _RUN_OPCODES:
             self._take_run(record)
         else:
             self._last = None
             self._take_other(record)
 
     def _take_index(self, record: Record) -> None:
-        self._stream.seek(record.body)
         try:
-            channel, size = MESSAGE_INDEX.unpack(self._stream.read(MESSAGE_INDEX.size))
+            channel, size = MESSAGE_INDEX.unpack_from(record.head)
         except struct.error:
             raise DamageError(f"the index of messages at byte {record.at} has no head") from None
-        if size != record.length - MESSAGE_INDEX.size or size % INDEX_ENTRY_BYTES:
+        if size != record.length - MESSAGE_INDEX_BYTES or size % INDEX_ENTRY_BYTES:
             raise DamageError(f"the lengths of the index of messages at byte {record.at} do not add up")
         if self._last is None or self._last.head is None:
             if self._recover:
@@ -311,23 +323,21 @@ class Surveyor:
         if channel in self._last.index:
             raise DamageError(f"{self._last.what} has two indices of channel {channel}")
         if size:
-            self._last.index[channel] = IndexRecord(record.body + MESSAGE_INDEX.size, size // INDEX_ENTRY_BYTES)
+            self._last.index[channel] = IndexRecord(record.at, size // INDEX_ENTRY_BYTES)
 
     def _take_run(self, record: Record) -> None:
         """Add a schema, a channel or a message outside chunks: to the run before it, or to the summary."""
-        if self._data_ended and record.opcode != Opcode.MESSAGE:
+        if self._data_ended and record.opcode != MESSAGE_OPCODE:
             self._take_other(record)
             return
         self._check_section(record, "a message")
         run = self._last
         if run is None or run.head is not None or run.end != record.at or run.end - run.at > RUN_BYTES:
             run = Block(record.at, record.at, None, 0, 0, counts={})
-        if record.opcode == Opcode.MESSAGE:
-            self._stream.seek(record.body)
-            head = self._stream.read(MESSAGE.size)
-            if record.length < MESSAGE.size or len(head) < MESSAGE.size:
+        if record.opcode == MESSAGE_OPCODE:
+            if min(record.length, len(record.head)) < MESSAGE_BYTES:
                 raise DamageError(f"the message at byte {record.at} has no head")
-            channel, _, time, _ = MESSAGE.unpack(head)
+            channel, _, time, _ = MESSAGE.unpack_from(record.head)
             counts = run.counts if run.counts is not None else {}
             run.start_time = min(run.start_time, time) if counts else time
             run.end_time = max(run.end_time, time)
@@ -344,7 +354,9 @@ class Surveyor:
         """Add a record of the summary, an attachment or metadata; pass over all others."""
         found, opcode = self._found, record.opcode
         summary = found.summary
-        if opcode == Opcode.ATTACHMENT:
+        if opcode == _CHUNK_INDEX_OPCODE:
+            summary.chunks.append(parse_chunk_index(read_body(self._stream, record)))
+        elif opcode == Opcode.ATTACHMENT:
             found.attachments.append(record)
         elif opcode == Opcode.METADATA:
             found.metadata.append(record)
@@ -354,8 +366,6 @@ class Surveyor:
                 raise DamageError(f"its summary is said to begin at byte {self._summary_start}, not {record.end}")
         elif opcode == Opcode.STATISTICS:
             summary.statistics = parse(Statistics, read_body(self._stream, record))
-        elif opcode == Opcode.CHUNK_INDEX:
-            summary.chunks.append(parse(ChunkIndex, read_body(self._stream, record)))
         elif opcode == Opcode.ATTACHMENT_INDEX:
             summary.attachments.append(parse(AttachmentIndex, read_body(self._stream, record)))
         elif opcode == Opcode.METADATA_INDEX:
@@ -391,12 +401,13 @@ class Surveyor:
         try:
             record = record_at(self._stream, at, self._size)
             if record.opcode == Opcode.CHUNK:
-                read_chunk_head(self._stream, record)
+                read_chunk_head(record)
                 return True
             if record.opcode == Opcode.MESSAGE_INDEX:
-                self._stream.seek(record.body)
-                _, size = MESSAGE_INDEX.unpack(self._stream.read(MESSAGE_INDEX.size))
+                _, size = MESSAGE_INDEX.unpack_from(record.head)
                 return bool(size == record.length - MESSAGE_INDEX.size and size % INDEX_ENTRY_BYTES == 0)
+            if record.opcode == Opcode.CHUNK_INDEX:
+                return record.length <= MAX_PARSED and bool(parse_chunk_index(read_body(self._stream, record)))
             if record.opcode in _PARSED:
                 return record.length <= MAX_PARSED and _is_parsed(self._stream, record)
         except (DamageError, struct.error):
