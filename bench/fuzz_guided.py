@@ -28,7 +28,7 @@ from typing import Any
 from prim.text import printable
 
 TIMEOUT, MEMORY = 20, 2048
-"""What an input may take (s, MB): the limits of issue 22 are those of bench.fuzz, which measures each case."""
+"""What an input may take (s, MB): bench.fuzz has the limits that hold, and measures each case."""
 LONGEST = 200_000
 """Of an input (bytes)."""
 SHARES = {"logs": 5, "codecs": 3, "documents": 1, "networks": 1}

@@ -67,7 +67,7 @@ class MapBoundsOptions:
     noise_tail_share: float = 0.0025
     passes: int = 6
     margin: int = 5
-    sampled_rays: int = 100_000
+    sampled_rays: int = 30_000
     least_gain: float = 0.1
     free_cells: int = 30_000_000
     cells_per_ray: int = 1000

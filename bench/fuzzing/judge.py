@@ -13,7 +13,7 @@ LISTING = "--list"
 
 @dataclass(frozen=True)
 class Limits:
-    """What a run may take, by the size N of its input; issue 22 sets the numbers.
+    """What a run may take, by the size N of its input.
 
     Attributes:
         seconds: CPU time (s).

@@ -15,7 +15,7 @@ from mcap.records import Channel, Message, Schema
 from rosbags.typesys import Stores, get_typestore
 
 from bench.fuzzing.case import Case
-from bench.fuzzing.mcap_file import Assembly
+from bench.fuzzing.mcap_file import CHUNKED, Assembly, Chunked
 from bench.fuzzing.samples import Samples
 from prim.log.decoding.ros import decode_scan
 from prim.log.messages import GPS_TOPIC, ODOM_TOPIC, SCAN_TOPIC, encode_scan
@@ -347,10 +347,14 @@ def _wrap(value: Any, bits: int) -> None:
 
 
 def _mcap(
-    content: LogContent, types: dict[str, str], messages: Sequence[tuple[str, int, bytes]], is_ros1: bool
+    content: LogContent,
+    types: dict[str, str],
+    messages: Sequence[tuple[str, int, bytes]],
+    is_ros1: bool,
+    chunked: Chunked = CHUNKED,
 ) -> bytes:
     """Return an MCAP file of these messages."""
-    file = Assembly(profile="ros1" if is_ros1 else "ros2")
+    file = Assembly(chunked, "ros1" if is_ros1 else "ros2")
     channels = {topic: number for number, topic in enumerate(types, 1)}
     for topic, number in channels.items():
         name = types[topic].replace("/msg/", "/") if is_ros1 else types[topic]
@@ -368,7 +372,9 @@ def message_record(channel: int, log_time: int, data: bytes) -> Message:
 
 
 def wild_scans(rng: random.Random, samples: Samples) -> Case:
-    """Make scans of many beams or long ranges, as a stranger's scanner has them: nothing is damaged.
+    """Make scans of many beams or long ranges, as a stranger's scanner has them: nothing is damaged, nor packed.
+
+    What a mapper takes is measured by the rays that there are, however well these could be packed.
 
     Args:
         rng: The source of randomness.
@@ -392,4 +398,6 @@ def wild_scans(rng: random.Random, samples: Samples) -> Case:
         messages.append((topic, log_time, data))
     what = f"{beams} beams, {share:.0%} of them {far:g} m"
     options = ("--no-viewer", *rng.choice(MODES).split())
-    return Case(what, {"log.mcap": _mcap(content, content.types, messages, False)}, options=options)
+    return Case(
+        what, {"log.mcap": _mcap(content, content.types, messages, False, Chunked(compression=""))}, options=options
+    )

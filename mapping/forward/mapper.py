@@ -243,13 +243,17 @@ class ForwardMapper:
             factor *= 2
         return coarsened(frame, factor)
 
+    def _neighbour_noise(self) -> float:
+        """Return the noise (m) as neighbouring beams show it, within what can be estimated; 0 without any."""
+        return min(neighbour_noise(self._rays.ranges) or 0.0, self.options.max_noise)
+
     def _initial_noise(self, resolution: float) -> RangeNoise:
         """Return the noise to start from: as given (but bounded by the cells), else from neighbouring beams."""
         options = self.options
         if self._fixed_std is not None:
             std = max(self._fixed_std, options.min_given_noise_cells * resolution)
             return RangeNoise(std, options.min_outlier_share)
-        guess = max(neighbour_noise(self._rays.ranges) or 0.0, self.resolution)
+        guess = max(self._neighbour_noise(), self.resolution)
         std = min(max(self._start_std or guess, guess), options.max_start_ratio * guess)
         return RangeNoise(std, options.min_outlier_share)
 
@@ -262,7 +266,7 @@ class ForwardMapper:
         holds_out = estimates_noise and len(self._rays) >= options.hold_out_min_rays
         fold = Fold.FITTED if holds_out else Fold.ALL
         noise = self._initial_noise(self.resolution)
-        guess = neighbour_noise(self._rays.ranges) or 0.0
+        guess = self._neighbour_noise()
         level: Level | None = None
         factors = level_factors(noise.std / self.resolution, options)
         for factor in [factor for factor in factors if factor >= last] or [last]:

@@ -71,10 +71,13 @@ class PosedScans:
         """Return what a user should know of the poses and of scans that were left out."""
         notes = [*self.poses.notes, *self.scan_log.notes()]
         if self._endless:
-            notes.append(
-                "the log gives no longest range: beams without a return say nothing; if it is known, give it, as in "
-                f"--max-range {math.ceil(self._farthest)}, which is as far as any beam returned from"
-            )
+            note = "the log gives no longest range: beams without a return say nothing"
+            if self._farthest > 0:
+                note += (
+                    f"; if it is known, give it, as in --max-range {math.ceil(self._farthest)}, which is as far as "
+                    "any beam returned from"
+                )
+            notes.append(note)
         outside = int(np.count_nonzero(~self.poses.valid))
         if outside:
             notes.append(f"{pluralize(outside, 'scan')} outside the time of the poses: not used")
