@@ -371,6 +371,10 @@ def message_record(channel: int, log_time: int, data: bytes) -> Message:
     return Message(channel_id=channel, log_time=log_time, data=data, publish_time=log_time, sequence=0)
 
 
+MATCHED_BEAMS = 100
+"""Scans of more beams are not matched: that takes a tenth of a second for each, however large the log is."""
+
+
 def wild_scans(rng: random.Random, samples: Samples) -> Case:
     """Make scans of many beams or long ranges, as a stranger's scanner has them: nothing is damaged, nor packed.
 
@@ -397,7 +401,6 @@ def wild_scans(rng: random.Random, samples: Samples) -> Case:
             data = encode_scan(replace(scan, angle_max=scan.angle_min + step * (beams - 1)))
         messages.append((topic, log_time, data))
     what = f"{beams} beams, {share:.0%} of them {far:g} m"
-    options = ("--no-viewer", *rng.choice(MODES).split())
-    return Case(
-        what, {"log.mcap": _mcap(content, content.types, messages, False, Chunked(compression=""))}, options=options
-    )
+    modes = [mode for mode in MODES if beams <= MATCHED_BEAMS or "--match-scans" not in mode]
+    log = _mcap(content, content.types, messages, False, Chunked(compression=""))
+    return Case(what, {"log.mcap": log}, options=("--no-viewer", *rng.choice(modes).split()))
