@@ -26,7 +26,7 @@ Bounds = tuple[float, float, float, float]
 """An axis-aligned rectangle of the map frame: x0, y0, x1, y1 (m), the least x and y first."""
 
 
-MAX_ITEMS = 20_000
+MAX_ITEMS = 10_000
 """A world has no more primitives, and no more walls: each is met by every beam's ray. Set by hand."""
 
 

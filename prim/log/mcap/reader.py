@@ -26,6 +26,7 @@ from prim.log.mcap.records import (
     MESSAGE_BYTES,
     PREFIX_BYTES,
     Contents,
+    CutError,
     DamageError,
     Record,
     parse,
@@ -468,6 +469,7 @@ def damage_refused(path: Path) -> Iterator[None]:
     try:
         yield
     except DamageError as error:
-        raise LogReadError(path, f"truncated or damaged: {error}", RECOVER_HINT) from error
+        what = "truncated or damaged" if isinstance(error, CutError) else "damaged"
+        raise LogReadError(path, f"{what}: {error}", RECOVER_HINT) from error
     except OSError as error:
         raise LogReadError(path, f"cannot be read: {error.strerror or error}", RECOVER_HINT) from error

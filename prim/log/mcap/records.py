@@ -71,6 +71,10 @@ class DamageError(ValueError):
     """What does not fit together in a file."""
 
 
+class CutError(DamageError):
+    """A file that ends before a record does, or before its end."""
+
+
 class Record(NamedTuple):
     """A record at the top level of a file.
 
@@ -151,12 +155,12 @@ def record_at(stream: IO[bytes], at: int, size: int) -> Record:
     stream.seek(at)
     head = stream.read(PREFIX_BYTES + HEAD_BYTES)
     if len(head) < PREFIX_BYTES:
-        raise DamageError("it ends within a record")
+        raise CutError("it ends within a record")
     opcode, length = PREFIX.unpack_from(head)
     if opcode not in KNOWN_OPCODES and opcode < FIRST_PRIVATE_OPCODE:
         raise DamageError(f"no record begins at byte {at}")
     if length > size - at - PREFIX_BYTES:
-        raise DamageError(f"the record at byte {at} runs past the end")
+        raise CutError(f"the record at byte {at} runs past the end")
     return Record(opcode, at, length, head[PREFIX_BYTES:])
 
 
@@ -178,7 +182,7 @@ def read_body(stream: IO[bytes], record: Record) -> bytes:
     stream.seek(record.body)
     data = stream.read(record.length)
     if len(data) < record.length:
-        raise DamageError("it ends within a record")
+        raise CutError("it ends within a record")
     return data
 
 

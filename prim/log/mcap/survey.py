@@ -24,6 +24,7 @@ from prim.log.mcap.records import (
     PREFIX,
     PREFIX_BYTES,
     ChunkHead,
+    CutError,
     DamageError,
     IndexedChunk,
     Record,
@@ -268,7 +269,7 @@ class Surveyor:
         end = self._stream.read()
         try:
             if len(end) < END_BYTES or not end.endswith(MAGIC) or end[0] != Opcode.FOOTER:
-                raise DamageError(f"its end is missing ({size} bytes)")
+                raise CutError(f"its end is missing ({size} bytes)")
             start, _, crc = _FOOTER.unpack_from(end, PREFIX.size)
             if start > size - END_BYTES:
                 raise DamageError("its summary lies beyond its end")
