@@ -26,7 +26,7 @@ from prim.log.messages import TRUE_PRIMITIVES_TOPIC
 from recorder.sensors import Lidar
 from recorder.session import SessionOptions, record_session
 from recorder.world import WorldOptions
-from replay.map_bounds import grid_frame_of_world
+from replay.mapping.bounds import grid_frame_of_world
 
 NOISE = (0.05, 0.1, 0.25, 0.5)
 RESOLUTION = 0.01

@@ -28,7 +28,7 @@ from prim.choices import MapperName
 from prim.log import open_log
 from prim.scan import Scan
 from prim.se2 import Pose2D
-from replay.map_bounds import extent_of_scans
+from replay.mapping.bounds import extent_of_scans
 
 EVERY = 5
 CLIPS = (1e-5, 1e-4, 1e-3, 1e-2)

@@ -15,7 +15,7 @@ from prim.se2 import Pose2D
 from prim.shapes import Primitive
 from recorder.session import SessionOptions, record_session
 from replay.ground_truth import GroundTruth
-from replay.map_bounds import grid_frame_of_world
+from replay.mapping.bounds import grid_frame_of_world
 from replay.poses.pose_provider import PoseProvider
 from replay.scans.posed_scans import PosedScans
 from replay.scans.scan_log import ScanLog

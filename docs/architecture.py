@@ -60,7 +60,7 @@ SCAN = (
     ),
     Stage(
         "Map it: a branch for each mapper",
-        (("replay/mapping_stage.py", "MappingStage"), ("mapping/mapper.py", "Mapper")),
+        (("replay/mapping/stage.py", "MappingStage"), ("mapping/mapper.py", "Mapper")),
         "OccupancyGrid",
     ),
     Stage(

@@ -31,7 +31,7 @@ from prim.threads import cores
 from prim.world import Bounds
 from replay.keywords import PARAMETERS, SWITCHES, ReplayKeywords, replay_options
 from replay.localization import localize, pose_scans
-from replay.mapping_stage import blames_log_for_size
+from replay.mapping.stage import blames_log_for_size
 from replay.notes import pluralize
 from replay.options import ReplayOptions
 from replay.outputs.exports import log_stem, write_map, write_report, write_trajectory

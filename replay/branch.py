@@ -10,7 +10,7 @@ from prim.interrupts import Interrupts
 from prim.scan import PosedScan
 from replay.detection.stage import DetectionResult, DetectionStage, make_detection_stage
 from replay.intervals import NEVER, snapshot_interval
-from replay.mapping_stage import MappingStage, Usage, make_replay_mapper
+from replay.mapping.stage import MappingStage, Usage, make_replay_mapper
 from replay.options import ReplayOptions
 from replay.replay_evaluator import ReplayEvaluator
 from replay.scans.posed_scans import PosedScans

@@ -15,9 +15,9 @@ from prim.scan import PosedScan
 from replay.branch import Branch
 from replay.ground_truth import GroundTruth
 from replay.localization import Localization, localize, pose_scans
-from replay.map_bounds import choose_map_bounds
-from replay.mapping_stage import blames_log_for_size
-from replay.memory import MemoryBudget
+from replay.mapping.bounds import choose_map_bounds
+from replay.mapping.memory import MemoryBudget
+from replay.mapping.stage import blames_log_for_size
 from replay.options import ReplayOptions
 from replay.replay_evaluator import ReplayEvaluator
 from replay.result import ReplayResult, distinct_notes

@@ -41,13 +41,17 @@ ARROWS: dict[str, set[str]] = {
     "replay/detection": {
         "prim", "mapping", "detect", "detect/networks", "detect/refinement", "replay", "replay/poses", "replay/scans",
     },
+    "replay/mapping": {
+        "prim", "mapping", "mapping/forward", "replay", "replay/poses", "replay/scans",
+    },
     "replay/outputs": {"prim", "mapping", "detect", "replay", "replay/detection", "replay/poses"},
     "replay/viewing": {
         "prim", "mapping", "detect", "replay", "replay/detection", "replay/outputs", "replay/poses",
     },
     "replay": {
         "prim", "prim/log", "prim/log/decoding", "mapping", "mapping/forward", "detect", "detect/networks",
-        "detect/refinement", "replay/scans", "replay/detection", "replay/outputs", "replay/poses", "replay/viewing",
+        "detect/refinement", "replay/scans", "replay/detection", "replay/mapping", "replay/outputs", "replay/poses",
+        "replay/viewing",
     },
 }  # fmt: skip
 """For each folder the folders that its files may import from, beside itself."""
@@ -66,6 +70,7 @@ ENDS = {
     ("replay/viewing", "replay/outputs"): {"report"},
     ("replay/scans", "replay"): {"notes", "timing"},
     ("replay/viewing", "replay/detection"): {"stage"},
+    ("replay/mapping", "replay"): {"options", "timing"},
     ("replay/outputs", "replay"): {"result", "notes"},
     ("replay/detection", "replay"): {"ground_truth", "intervals", "options", "timing"},
 }

@@ -21,8 +21,7 @@ from prim.log.decoding.codecs import Codec, Content
 from prim.log.decoding.values import StampedPose, checked_stamp, quaternion
 from prim.log.limits import ROW_LIMITS, records_limit
 from prim.log.log_file import LogFile
-from prim.log.reader import LogReader
-from prim.log.recovery import RECOVER_HINT
+from prim.log.reader import RECOVER_HINT, LogReader
 from prim.log.source import Message, Topic
 from prim.scan import Scan
 from prim.se2 import Pose2D, wrap_angle

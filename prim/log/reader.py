@@ -17,6 +17,8 @@ from prim.log.log_file import ZSTD_MAGIC, LogFile
 from prim.log.source import Message, Numbered, Topic
 from prim.log.time_resets import LATEST, as_stamps
 
+RECOVER_HINT = "read what is left of it with --recover"
+
 MAX_LOST = 100
 """So many losses are listed one by one."""
 

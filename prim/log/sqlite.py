@@ -23,8 +23,7 @@ from prim.errors import LogReadError
 from prim.log.decoding.codecs import SCAN_CONTENTS, content_of
 from prim.log.limits import ROW_LIMITS, memory_limit, records_limit, unpacked_limit
 from prim.log.log_file import LogFile
-from prim.log.reader import LogReader
-from prim.log.recovery import RECOVER_HINT
+from prim.log.reader import RECOVER_HINT, LogReader
 from prim.log.source import Message, Topic
 from prim.log.time_resets import as_stamps, find_shifts, moved_behind_resets, reset_notes
 

@@ -35,8 +35,7 @@ from prim.log.mcap.records import (
     unpack_chunk,
 )
 from prim.log.mcap.survey import Block, IndexRecord, Survey, Surveyor
-from prim.log.reader import MAX_LOST, LogReader, ros2_name
-from prim.log.recovery import RECOVER_HINT
+from prim.log.reader import MAX_LOST, RECOVER_HINT, LogReader, ros2_name
 from prim.log.source import Message, Topic
 from prim.log.time_resets import LATEST, as_stamps, find_shifts, moved_behind_resets, reset_notes
 

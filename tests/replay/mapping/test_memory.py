@@ -7,7 +7,7 @@ import pytest
 from mapping.grid import GridFrame
 from prim.errors import LogReadError, UsageError
 from prim.memory import machine_memory
-from replay.memory import MemoryBudget
+from replay.mapping.memory import MemoryBudget
 from replay.options import ReplayOptions
 
 FRAME = GridFrame(0.01, 0, 0, 1000, 1000)

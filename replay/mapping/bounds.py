@@ -49,7 +49,7 @@ class MapBoundsOptions:
             the map's smaller side than this.
         cells_per_std: Cells of the coarse forward map in a standard deviation of the noise.
         noise_tail_share: The map leaves out this share of the end points at either end of either axis, after the
-            coarse map has told from which cells they are.
+            coarse map has found the cells that they are from.
         passes: The coarse map is made anew within its own bounds at most so often.
         margin: The map then reaches so many of its cells beyond them.
         sampled_rays: A coarse map is made of about so many rays.
@@ -313,7 +313,7 @@ def _without_noise(
 ) -> Bounds:
     """Return the bounds of the cells that end points are from, by coarse forward maps, and of the sensor.
 
-    Each map within smaller bounds tells more of them from their noise, since beams that end outside leave no cells
+    Each map within smaller bounds separates them better from their noise: beams that end outside leave no cells
     there to explain them. Bounds that are not blurred stay as they are: by the noise as neighbouring beams show it,
     and by that of the map.
     """

@@ -18,7 +18,7 @@ from prim.errors import LogReadError
 from prim.scan import PosedScan, Scan
 from prim.se2 import Pose2D
 from prim.world import World
-from replay.map_bounds import MapBounds, choose_map_bounds, extent_of_scans, grid_frame_of_world
+from replay.mapping.bounds import MapBounds, choose_map_bounds, extent_of_scans, grid_frame_of_world
 from replay.options import ReplayOptions
 from replay.scans.posed_scans import PosedScans
 
