@@ -267,6 +267,8 @@ def _with_poses(
     name, (logged, stamps) = next(iter(scan_times.items()))
     reference = _find_lag(logged, clock.stamps(name, stamps, logged), options)
     for topic in _moving_topics(log):
+        if topic.messages < MIN_POSES:
+            continue
         times = _times(log, topic, options.first)
         if len(times[0]) < MIN_POSES:
             continue
