@@ -41,6 +41,9 @@ from prim.log.time_resets import LATEST, as_stamps, find_shifts, moved_behind_re
 
 ALL_CHANNELS = range(1 << 16)
 
+NO_CRC = bytes(4)
+"""What stands in the place of an attachment's CRC where it has none."""
+
 
 class McapReader(LogReader):
     """An MCAP log that is open for reading: a :class:`prim.log.source.LogSource`.
@@ -367,13 +370,18 @@ class McapReader(LogReader):
                 self._damage(f"its metadata at byte {record.at}: {error}")
 
     def _read_attachment(self, record: Record) -> tuple[Attachment, bool]:
-        """Return an attachment, and whether its CRC holds or there is none. Raises DamageError."""
+        """Return an attachment, and whether its CRC holds or there is none. Raises DamageError.
+
+        Zeros may have been written over both it and the end of the data, in a log that has CRCs elsewhere.
+        """
         body = read_body(self._file, record)
         attachment = parse(Attachment, body)
         builder = RecordBuilder()
         attachment.write(builder)
-        crc = body[-4:]
-        return attachment, crc in (b"\0\0\0\0", builder.end()[-4:])  # type: ignore[no-untyped-call]
+        if body[-4:] != NO_CRC:
+            return attachment, body[-4:] == builder.end()[-4:]  # type: ignore[no-untyped-call]
+        has_crcs = any(block.head and block.head.crc for block in self._survey.blocks)
+        return attachment, not (has_crcs and attachment.data.endswith(b"\0"))
 
 
 def _same_entries(index: bytes, found: list[int]) -> bool:
