@@ -454,3 +454,12 @@ def test_plain_steps_raise_the_likelihood_of_every_pass(noisiest: Session) -> No
     mapper.finish()
     finest = [statistics.log_likelihood for factor, statistics in mapper.history if factor == 1]
     assert len(finest) > 2 and (np.diff(finest) > 0).all()
+
+
+def test_ranges_of_ten_thousand_kilometres_cost_no_more_memory() -> None:
+    """The first guess of the noise is bounded as its estimate is: else a kernel of its width would take gigabytes."""
+    mapper = ForwardMapper(0.01, (-0.2, -0.2, 0.2, 0.2))
+    for z in (1e7, 0.1, 1e7, 0.15):
+        mapper.accumulate(Scan(0, "", 0.0, 0.1, 0.01, 2e7, np.array([z], dtype=np.float32)), Pose2D())
+    assert mapper._initial_noise(0.01).std <= mapper.options.max_noise
+    assert mapper.finish().frame.shape == (40, 40)

@@ -20,7 +20,7 @@ from mcap.records import Statistics
 from mcap.writer import CompressionType, IndexType, Writer
 
 from prim.errors import LogReadError
-from prim.log import limits
+from prim.log import limits, open_log
 from prim.log.mcap.records import MAGIC, PREFIX, Record, parse, parse_chunk_index
 from prim.log.mcap.survey import Surveyor
 from prim.log.source import Message
@@ -280,3 +280,21 @@ def test_chunks_that_overlap_are_sorted_within_limits(tmp_path: Path, monkeypatc
     monkeypatch.setattr("prim.log.mcap.reader.memory_limit", lambda size: 8_000)
     messages, lost, _ = stored(path, recover=True)
     assert len(messages) == 100 and not lost
+
+
+def test_zeros_over_an_attachment_and_its_crc_are_damage(tmp_path: Path) -> None:
+    """An attachment without a CRC is none; but one that ends in zeros, in a log that has CRCs, is."""
+    path = tmp_path / "a.mcap"
+    with LogWriter(path) as log:
+        log.add_attachment("world.json", "application/json", b"{}" * 400, 0)
+        log.add_topic("/scan", CONTENT.types["/scan"])
+        for message in CONTENT.messages:
+            if message.topic == "/scan":
+                log.write(*message)
+    data = path.read_bytes()
+    end = data.index(b"{}{}") + 800 + 4
+    path.write_bytes(data[: end - HOLE] + bytes(HOLE) + data[end:])
+    with open_log(path) as damaged, pytest.raises(LogReadError, match=r"CRC of its attachment world.json.*--recover"):
+        damaged.attachment("world.json")
+    with open_log(path, recover=True) as recovered:
+        assert recovered.attachment("world.json") is None and recovered.lost
