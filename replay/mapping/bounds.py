@@ -75,8 +75,6 @@ class MapBoundsOptions:
 
 OPTIONS = MapBoundsOptions()
 
-SURFACES = "within which the surfaces lie"
-
 MAX_COARSE_CELLS = 400
 """A coarse map has at most about so many rows and columns."""
 
@@ -134,7 +132,8 @@ def choose_map_bounds(
     if _area(sharp) < (1 - options.least_gain) * _area(bounds):
         bounds = sharp
         share = float(np.mean(~_inside(points, bounds)))
-        what = f"range noise of about {noise:.2g} m carries {share:.0%} of the end points beyond {{}}, {SURFACES}"
+        beyond = f"range noise of about {noise:.2g} m carries {share:.0%} of the end points beyond "
+        what = beyond + "{}, within which the surfaces lie"
         notes.append(_note(what, bounds, extent, replay.resolution))
     return MapBounds(_frame(bounds, replay.resolution, rays, options), tuple(notes))
 
