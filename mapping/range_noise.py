@@ -28,6 +28,20 @@ class NoiseBounds:
 DEFAULTS = NoiseBounds()
 
 
+@dataclass(frozen=True)
+class NoiseOptions:
+    """How noise is estimated without a map.
+
+    Attributes:
+        most_ranges: Of more ranges, evenly spread pairs are used, about so many: all would take memory.
+    """
+
+    most_ranges: int = 1_000_000
+
+
+OPTIONS = NoiseOptions()
+
+
 def check_noise(noise_std: float, bounds: NoiseBounds = DEFAULTS) -> None:
     """Check a range noise that was given.
 
@@ -43,17 +57,24 @@ def check_noise(noise_std: float, bounds: NoiseBounds = DEFAULTS) -> None:
         raise UsageError(f"--noise-std is {noise_std:g}: it must be above 0, {allowed}")
 
 
-def neighbour_noise(ranges: NDArray[np.float32]) -> float | None:
+def neighbour_noise(ranges: NDArray[np.float32], options: NoiseOptions = OPTIONS) -> float | None:
     """Estimate the range noise from the differences of neighbouring beams, by their median absolute deviation.
 
     Args:
         ranges: Ranges (N,) in m, in the order of their beams; those that are not finite are left out.
+        options: How many of them are used.
 
     Returns:
         The standard deviation (m), too large where the ranges of neighbouring beams differ by themselves; None where
         there are no two beams.
     """
-    differences = np.diff(ranges[np.isfinite(ranges)])
+    if len(ranges) > options.most_ranges:
+        step = len(ranges) // options.most_ranges + 1
+        with np.errstate(invalid="ignore"):  # beams without a return, next to each other
+            differences = ranges[1::step] - ranges[:-1:step]
+        differences = differences[np.isfinite(differences)]
+    else:
+        differences = np.diff(ranges[np.isfinite(ranges)])
     if not len(differences):
         return None
     return float(np.median(np.abs(differences))) * NORMAL_MAD / math.sqrt(2)

@@ -163,6 +163,18 @@ class RayStore:
         self._first[self._count] = end
         return count
 
+    def trim(self) -> None:
+        """Give back the room for further rays."""
+        _trim(self._rays, len(self))
+        _trim(self._scans, self._count)
+        _trim(self._first, self._count + 1)
+
+
+def _trim(array: NDArray[Any], length: int) -> None:
+    """Leave an array ``length`` rows, and give the rest back. No view of it may be in use."""
+    if len(array) > length:
+        array.resize((length, *array.shape[1:]), refcheck=False)
+
 
 def _grow(array: NDArray[Any], length: int) -> None:
     """Make room in an array for ``length`` rows, and some more, where it has fewer.

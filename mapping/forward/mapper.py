@@ -261,6 +261,7 @@ class ForwardMapper:
         """Fit from coarse to fine, down to cells ``last`` times the frame's; then noise and map, see the module."""
         options = self.options
         self.history.clear()
+        self._rays.trim()
         self._is_estimated = False
         estimates_noise, is_thinned = self._fixed_std is None, len(self._rays) > options.thinning_rays
         holds_out = estimates_noise and len(self._rays) >= options.hold_out_min_rays
@@ -275,6 +276,7 @@ class ForwardMapper:
             finer.smooth(noise.std)
             if level is not None:
                 finer.initialize_from(level)
+                level.release_free_cells()  # and the memory of which rays skip them
                 finer.fix_free_cells(self._rays)
             stride = (options.coarsest_stride if level is None else options.stride) if is_thinned else 1
             noise = self._converge(finer, factor, RaySubset(stride=stride, fold=fold), noise, estimates_noise)
