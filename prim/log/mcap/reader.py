@@ -65,13 +65,14 @@ class McapReader(LogReader):
 
     def __init__(self, file: LogFile, recover: bool = False) -> None:
         super().__init__(file.path, recover, file)
+        self._hint = "" if recover else RECOVER_HINT
         self._limit = memory_limit(file.file_bytes)
         self._most_records = records_limit(file.file_bytes)
         self._file: IO[bytes] = file.data.open("rb")
         self._definitions = _Definitions()
         self._times: dict[int, Stamps] = {}
         try:
-            with damage_refused(self.path):
+            with damage_refused(self.path, self._hint):
                 self._survey = Surveyor(self._file, recover, self.lost).survey()
                 self._check_size(unpacked_limit(file.file_bytes))
                 self._counts = self._count_all() if recover else self._check_summary()
@@ -85,7 +86,7 @@ class McapReader(LogReader):
         self._channels: dict[str, list[int]] = {}
         for channel in self._definitions.channels.values():
             self._channels.setdefault(channel.topic, []).append(channel.id)
-        with damage_refused(self.path):
+        with damage_refused(self.path, self._hint):
             self._shifts = self._find_shifts()
         self.notes = reset_notes(self._shifts)
 
@@ -129,7 +130,7 @@ class McapReader(LogReader):
         """See :meth:`prim.log.reader.LogReader.log_times`: by the index where there is one."""
         if len(self._shifts) > 1:
             return super().log_times(topic)
-        with damage_refused(self.path):
+        with damage_refused(self.path, self._hint):
             channels = self._channels.get(topic, ())
             times = np.concatenate([np.zeros(0, np.int64), *map(self._written_times, channels)])
         return np.sort(times)
@@ -471,12 +472,20 @@ def _damaged_block(block: Block, error: Exception) -> str:
 
 
 @contextmanager
-def damage_refused(path: Path) -> Iterator[None]:
-    """Turn damage in a ``with`` block into a LogReadError that names ``path``."""
+def damage_refused(path: Path, hint: str) -> Iterator[None]:
+    """Turn damage in a ``with`` block into a LogReadError.
+
+    Args:
+        path: The log.
+        hint: What to do about it.
+
+    Yields:
+        Nothing.
+    """
     try:
         yield
     except DamageError as error:
         what = "truncated or damaged" if isinstance(error, CutError) else "damaged"
-        raise LogReadError(path, f"{what}: {error}", RECOVER_HINT) from error
+        raise LogReadError(path, f"{what}: {error}", hint) from error
     except OSError as error:
-        raise LogReadError(path, f"cannot be read: {error.strerror or error}", RECOVER_HINT) from error
+        raise LogReadError(path, f"cannot be read: {error.strerror or error}", hint) from error

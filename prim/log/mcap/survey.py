@@ -44,8 +44,8 @@ END_BYTES = PREFIX.size + _FOOTER.size + len(MAGIC)
 RUN_BYTES = 1 << 22
 """Records outside chunks are read in runs of about this size (bytes)."""
 
-SEARCH_BYTES = 1 << 20
-"""Behind damage, this much is searched at once for the next record (bytes)."""
+LEAST_SEARCH_BYTES, SEARCH_BYTES = 1 << 10, 1 << 20
+"""Behind damage, this much is searched at once for the next record (bytes): little at first, then more and more."""
 
 MAX_PARSED = 1 << 16
 """A record that is searched for, and recognised by its fields, is no longer (bytes)."""
@@ -259,7 +259,7 @@ class Surveyor:
         if self._missing_end and not self._lost:
             self._lost.append(self._missing_end)
         if self._lost and not self._found.blocks:
-            raise DamageError(f"no messages in it can be read ({'; '.join(self._lost)})")
+            raise DamageError(f"no messages in it can be read ({'; '.join(self._lost[:3])})")
         return self._found
 
     def _read_end(self) -> int:
@@ -386,15 +386,16 @@ class Surveyor:
         return found
 
     def _find_record(self, at: int) -> int | None:
+        size = LEAST_SEARCH_BYTES
         while at < self._size:
             self._stream.seek(at)
-            window = self._stream.read(SEARCH_BYTES)
+            window = self._stream.read(size)
             for match in _START.finditer(window):
                 if self._is_record(at + match.start(), CHAIN):
                     return at + match.start()
-            if len(window) < SEARCH_BYTES:
+            if len(window) < size:
                 return None
-            at += SEARCH_BYTES - PREFIX.size
+            at, size = at + size - PREFIX_BYTES, min(4 * size, SEARCH_BYTES)
         return None
 
     def _is_record(self, at: int, chain: int) -> bool:
