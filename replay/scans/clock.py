@@ -311,6 +311,8 @@ def _jumps(scan_times: Mapping[str, tuple[Stamps, Stamps]], options: ClockOption
 def _clock_with_resets(logged: Stamps, stamps: Stamps, jumps: Stamps) -> Clock:
     """Return the clock that puts what follows each reset behind what was before, as it was logged."""
     parts = np.searchsorted(jumps, logged, side="right")
+    if not np.bincount(parts, minlength=len(jumps) + 1).all():  # messages that are not in the order of their times
+        return HEADER_CLOCK
     offsets = [int(np.median(logged[parts == part] - stamps[parts == part])) for part in range(len(jumps) + 1)]
     relative = tuple(offset - offsets[0] for offset in offsets)
     if any(b <= a for a, b in pairwise(relative)):

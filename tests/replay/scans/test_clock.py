@@ -16,6 +16,7 @@ from prim.log.source import Message
 from prim.log.time_resets import find_shifts, moved_behind_resets
 from replay.poses.laser_poses import LaserPoses
 from replay.poses.pose_provider import PoseProvider
+from replay.scans.clock import HEADER_CLOCK, _clock_with_resets
 from replay.scans.scan_log import ScanLog, ScanLogOptions
 from replay.scans.selection import Selection
 from tests.encodings import ros2
@@ -215,3 +216,9 @@ def test_a_log_that_is_written_in_another_order_has_no_resets(seconds: list[int]
 
 def test_messages_of_nearly_the_same_time_are_no_reset() -> None:
     assert find_shifts(np.array([5, 4, 6] * 20, dtype=np.int64) * SECOND // 10) == (0,)
+
+
+def test_a_reset_before_the_first_scan_is_none() -> None:
+    """Scans that are not in the order in which they were logged: before the time of the reset there is none."""
+    logged = np.array([5, 6, 5, 6], dtype=np.int64) * SECOND
+    assert _clock_with_resets(logged, logged, np.array([5 * SECOND])) is HEADER_CLOCK
