@@ -31,9 +31,12 @@ BYTE_ORDER_MARK = b"\xef\xbb\xbf"
 """How a text begins that an editor saved as UTF-8."""
 
 START = re.compile(
-    rb"(\xef\xbb\xbf)?(\s*(#[^\n]*)?\n)*\s*(PARAM|SYNC|ODOM|TRUEPOS|[FR]LASER|ROBOTLASER\d|RAWLASER\d|NMEAGGA|NMEARMC|NEFF)\s"
+    rb"(\xef\xbb\xbf)?([^\S\n]*+(#[^\n]*+)?\n)*+[^\S\n]*+(PARAM|SYNC|ODOM|TRUEPOS|[FR]LASER|ROBOTLASER\d|RAWLASER\d|NMEAGGA|NMEARMC|NEFF)\s"
 )
-"""How a log of CARMEN begins: behind comments and empty lines, with one of its messages."""
+"""How a log of CARMEN begins: behind comments and empty lines, with one of its messages.
+
+All repetitions are possessive: else texts of blank lines would take for ever.
+"""
 
 PLAIN_LASER, LASER = re.compile(r"[FR]LASER"), re.compile(r"(ROBOT|RAW)LASER\d")
 ODOM = "ODOM"

@@ -43,7 +43,7 @@ MAX_NAME = 255
 """A file's name is no longer (bytes)."""
 
 _PATHS = re.compile(r"^ *relative_file_paths:[ \t]*\n((?: *- [^\n]*(?:\n|\Z))+)", re.MULTILINE)
-_PLAIN_NAME = re.compile(r""" *- (?:"([^"\\]*)"|'([^']*)'|(\w[\w.+ ()-]*[A-Za-z][\w.+ ()-]*))[ \t]*""")
+_PLAIN_NAME = re.compile(r""" *- (?:"([^"\\]*)"|'([^']*)'|(?=[\w.+ ()-]*[A-Za-z])(\w[\w.+ ()-]*+))[ \t]*""")
 """The list of files as rosbag2 writes it, and a file in it whose name needs no YAML to be read."""
 
 _LOG_NAME = re.compile(r"\.(mcap|db3|bag|bag\.active)(\.(zstd|zst|gz))?$")

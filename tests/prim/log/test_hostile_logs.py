@@ -24,7 +24,7 @@ from bench.fuzzing.formats import (
 from prim.errors import LogReadError
 from prim.log import bags, log_file, open_log, reader
 from prim.log.limits import memory_limit, records_limit, unpacked_limit
-from prim.log.log_file import LogFile
+from prim.log.log_file import HEAD_BYTES, LogFile
 from tests import hints
 from tests.encodings import ros1, ros2
 from tests.prim.log.small_log import small_log, stored
@@ -376,3 +376,14 @@ def test_names_of_many_files_are_not_all_shown(tmp_path: Path) -> None:
 
 def test_pieces_that_unpack_to_much_are_small() -> None:
     assert memory_limit(0) >= log_file.PACKED_BYTES * (128 << 10) // 4
+
+
+@pytest.mark.parametrize("text", [b"\n", b" \n", b"#\n", b"\t", b"\r\n", b"# \n\n"])
+def test_what_begins_a_text_is_found_in_linear_time(tmp_path: Path, text: bytes) -> None:
+    """Texts of blank lines alone: a test that does not end is one that fails."""
+    path = tmp_path / "a.log"
+    path.write_bytes(text * (HEAD_BYTES // len(text)))
+    with pytest.raises(LogReadError, match="not a log of a known format"):
+        stored(path)
+    path.write_bytes(text.replace(b"\t", b"\n") * 1000 + b"ODOM 0 0 0 0 0 0 1.0 h 1.0\n")
+    assert [message.topic for message in stored(path)[0]] == ["ODOM"]
