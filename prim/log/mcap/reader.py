@@ -199,9 +199,8 @@ class McapReader(LogReader):
         self._times = {channel: as_stamps(of_channel) for channel, of_channel in times.items()}
         if self._recover:
             self._complete_definitions(counts)
-            if len(self.lost) <= (
-                not self._survey.summary.crc_fits
-            ):  # else it shows in them that messages are missing
+            of_summary = 0 if self._survey.summary.crc_fits else 1
+            if len(self.lost) <= of_summary:  # else it is clear that messages are missing
                 self.lost += [*self._survey.contradictions(), *_miscounted(self._survey, counts)]
             if len(self.lost) > MAX_LOST:
                 self.lost[MAX_LOST:] = ["and more"]

@@ -127,7 +127,7 @@ class Block:
     @property
     def indexed_counts(self) -> dict[int, int]:
         """The number of messages by channel as its index says."""
-        return {channel: record.messages for channel, record in self.index.items()}
+        return {channel: record.messages for channel, record in self.index.items() if record.messages}
 
 
 @dataclass
@@ -209,8 +209,8 @@ def _compared(what: str, found: Sequence[int], indexed: Sequence[object], name: 
 
 
 def _agree(index: IndexedChunk, block: Block) -> bool:
-    """Return whether the index of chunks names a chunk's indices of messages: those that are not empty, at least."""
-    return all(index.indices.get(channel) == record.at for channel, record in block.index.items())
+    """Return whether the index of chunks names a chunk's indices of messages."""
+    return index.indices == {channel: record.at for channel, record in block.index.items()}
 
 
 class Surveyor:
@@ -323,8 +323,7 @@ class Surveyor:
             raise DamageError(f"there is an index of messages at byte {record.at}, and no chunk before it")
         if channel in self._last.index:
             raise DamageError(f"{self._last.what} has two indices of channel {channel}")
-        if size:
-            self._last.index[channel] = IndexRecord(record.at, size // INDEX_ENTRY_BYTES)
+        self._last.index[channel] = IndexRecord(record.at, size // INDEX_ENTRY_BYTES)
 
     def _take_run(self, record: Record) -> None:
         """Add a schema, a channel or a message outside chunks: to the run before it, or to the summary."""
