@@ -64,7 +64,7 @@ class MapBoundsOptions:
     free_margin: int = 200
     blurred_extent: float = 0.1
     cells_per_std: float = 15.0
-    noise_tail_share: float = 0.0025
+    noise_tail_share: float = 0.005
     passes: int = 6
     margin: int = 5
     sampled_rays: int = 30_000
