@@ -77,12 +77,14 @@ def localize(scans: ScanLog, options: ReplayOptions, timer: StageTimer) -> Local
         found = found._replace(poses=_with_suggested_mount(found.poses, found.scans, options, timer))
     if not options.match_scans:
         return found
-    from replay.poses.scan_matching import match_scans  # when it is needed: a replay without it starts faster
+    from replay.mapping.bounds import bounds_of_bulk  # when they are needed: a replay without them starts faster
+    from replay.poses.scan_matching import match_scans
 
     scans = found.scans
     posed = partial(pose_scans, scans, options=options, timer=timer)
+    bounds = options.bounds or bounds_of_bulk(posed(found.poses), options.resolution)
     poses = match_scans(
-        found.poses, scans.stamps, posed, options.resolution, options.noise_std, options.fuse.noise, options.bounds
+        found.poses, scans.stamps, posed, options.resolution, options.noise_std, options.fuse.noise, bounds
     )
     return found._replace(poses=poses)
 

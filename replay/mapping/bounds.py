@@ -44,6 +44,7 @@ class MapBoundsOptions:
         sampled_scans: The bulk of the end points is that of at least half as many scans, evenly spread.
         tail_share: The bulk leaves out this share of them at either end of either axis.
         fence: What is mapped reaches no farther beyond the bulk than this many times its extent.
+        slack: Where poses are still to be matched, the map reaches so many times its extent farther on each side.
         free_margin: Where no beam ends within reach, the map reaches so many cells beyond the sensor.
         blurred_extent: The noise is taken into account where three standard deviations of it are a larger share of
             the map's smaller side than this.
@@ -61,6 +62,7 @@ class MapBoundsOptions:
     sampled_scans: int = 400
     tail_share: float = 0.05
     fence: float = 2.0
+    slack: float = 0.25
     free_margin: int = 200
     blurred_extent: float = 0.1
     cells_per_std: float = 15.0
@@ -136,6 +138,30 @@ def choose_map_bounds(
         what = beyond + "{}, within which the surfaces lie"
         notes.append(_note(what, bounds, extent, replay.resolution))
     return MapBounds(_frame(bounds, replay.resolution, rays, options), tuple(notes))
+
+
+def bounds_of_bulk(posed_scans: PosedScans, resolution: float, options: MapBoundsOptions = OPTIONS) -> Bounds | None:
+    """Find bounds for a map that poses are matched with, where single end points or poses are far from all others.
+
+    Args:
+        posed_scans: The scans, with poses that are about right.
+        resolution: Side of a cell (m).
+        options: How bounds follow from end points.
+
+    Returns:
+        The bounds (m) of the others, and ``slack`` times their extent on each side; None where none is that far.
+    """
+    sample = _Sample(options.sampled_scans, resolution)
+    extent = sample.extent_of_all(posed_scans)
+    points = sample.end_points() if extent is not None else np.zeros((0, 2))
+    if extent is None or not len(points):
+        return None
+    fence = _fence(points, sample.positions(), options)
+    if _contains(fence, extent):
+        return None
+    (x0, y0, x1, y1), _ = _bounds_within(posed_scans, fence, extent, MAX_STEPS * resolution)
+    slack = options.slack * max(x1 - x0, y1 - y0)
+    return x0 - slack, y0 - slack, x1 + slack, y1 + slack
 
 
 def _frame(bounds: Bounds, resolution: float, rays: int, options: MapBoundsOptions) -> GridFrame:

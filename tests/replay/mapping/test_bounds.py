@@ -18,7 +18,7 @@ from prim.errors import LogReadError
 from prim.scan import PosedScan, Scan
 from prim.se2 import Pose2D
 from prim.world import World
-from replay.mapping.bounds import MapBounds, choose_map_bounds, extent_of_scans, grid_frame_of_world
+from replay.mapping.bounds import MapBounds, bounds_of_bulk, choose_map_bounds, extent_of_scans, grid_frame_of_world
 from replay.options import ReplayOptions
 from replay.scans.posed_scans import PosedScans
 
@@ -35,13 +35,17 @@ def scan_at(x: float, y: float, noise: float = 0.0, seed: int = 0) -> tuple[Scan
     return scan, Pose2D(x, y, 0.0)
 
 
-def chosen(scans: Sequence[tuple[Scan, Pose2D]], **options: Any) -> MapBounds:
+def source(scans: Sequence[tuple[Scan, Pose2D]]) -> PosedScans:
     posed = [PosedScan(k, scan, pose, ((scan, pose),)) for k, (scan, pose) in enumerate(scans)]
 
     class Source(list[PosedScan]):
         scan_log = SimpleNamespace(path=Path("a.mcap"), expected_rays=sum(len(scan.ranges) for scan, _ in scans))
 
-    return choose_map_bounds(cast(PosedScans, Source(posed)), ReplayOptions(**options), None)
+    return cast(PosedScans, Source(posed))
+
+
+def chosen(scans: Sequence[tuple[Scan, Pose2D]], **options: Any) -> MapBounds:
+    return choose_map_bounds(source(scans), ReplayOptions(**options), None)
 
 
 def places(count: int = 40) -> Iterator[tuple[float, float]]:
@@ -100,6 +104,15 @@ def test_noise_does_not_make_the_map_larger(noise: float, largest: float) -> Non
     assert (extent[2] - extent[0]) * (extent[3] - extent[1]) > (1 + 3 * noise) * area
     x0, y0, x1, y1 = frame.bounds
     assert max(x0, y0) <= -1.0 and min(x1, y1) >= 1.0, "the walls are on the map"
+
+
+def test_poses_are_matched_with_a_map_of_the_bulk() -> None:
+    """A map that grows with the scans is not at the mercy of one return, either."""
+    scans = [scan_at(*place) for place in places()]
+    assert bounds_of_bulk(source(scans), 0.01) is None
+    scans[3][0].ranges[17] = 3000.0
+    assert bounds_of_bulk(source(scans), 0.01) == pytest.approx((-1.5, -1.5, 1.5, 1.5), abs=0.02)
+    assert bounds_of_bulk(source([]), 0.01) is None
 
 
 def test_without_end_points_the_map_is_what_is_free_around_the_sensor() -> None:
