@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Iterator, Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -24,6 +25,9 @@ SCHEMA = "prim-list/1"
 
 SECOND = 1_000_000_000
 """Nanoseconds."""
+
+MOST_DESCRIBED = 300
+"""The messages of so many topics are read for their frames and their lag; a robot has no more of use here."""
 
 SAMPLED = 2000
 """The clock of a topic is found from this many of its first messages."""
@@ -142,8 +146,14 @@ def summarize_log(path: Path, options: ReplayOptions) -> LogSummary:
         start = min((first for first, _ in times.values()), default=0)
         end = max((last for _, last in times.values()), default=0)
         topics = sorted(log.topics.values(), key=lambda topic: topic.name)
-        rows = tuple(_summarize_topic(log, topic, times.get(topic.name), start) for topic in topics)
+        described = {topic.name for topic in [topic for topic in topics if topic.content][:MOST_DESCRIBED]}
+        rows = tuple(
+            _summarize_topic(log if topic.name in described else None, topic, times.get(topic.name), start)
+            for topic in topics
+        )
         scans, poses, notes = _choices(log, options)
+        if sum(topic.content is not None for topic in topics) > MOST_DESCRIBED:
+            notes = (*notes, f"the frames and the lag of the first {MOST_DESCRIBED} topics are shown, of no others")
         duration = (end - start) / SECOND
         return LogSummary(path, log.format, duration, rows, scans, poses, notes, tuple(log.lost))
 
@@ -157,15 +167,17 @@ def _logged_times(log: LogSource) -> Mapping[str, tuple[int, int]]:
     return found
 
 
-def _summarize_topic(log: LogSource, topic: Topic, times: tuple[int, int] | None, start: int) -> TopicSummary:
+def _summarize_topic(log: LogSource | None, topic: Topic, times: tuple[int, int] | None, start: int) -> TopicSummary:
+    """Describe a topic; its frames and its lag only with the log that it is of."""
     if times is None:
         return TopicSummary(topic, None, None, None, (), None)
     first, last = times
     rate = (topic.messages - 1) * SECOND / (last - first) if last > first and topic.messages > 1 else None
-    try:
-        frames, lag = tuple(_frames(log, topic)), _lag(log, topic)
-    except LogReadError:  # a choice of it, or --recover, says so
-        frames, lag = (), None
+    frames: tuple[str, ...] = ()
+    lag = None
+    if log is not None:
+        with suppress(LogReadError):  # a choice of it, or --recover, says so
+            frames, lag = tuple(_frames(log, topic)), _lag(log, topic)
     return TopicSummary(topic, (first - start) / SECOND, (last - start) / SECOND, rate, frames, lag)
 
 

@@ -397,6 +397,8 @@ def _range(call: Call) -> Inferred:
     start, limit, delta = (call.known(i) for i in range(3))
     if any(part.size != 1 or part.dtype != start.dtype for part in (start, limit, delta)):
         raise call.fail("has bounds that are no single numbers")
+    if not all(float(part.item()).is_integer() for part in (start, limit, delta) if np.isfinite(part).all()):
+        raise call.fail("counts in fractions, which versions of ONNX Runtime round in different ways")
     steps = _steps(start, limit, delta)
     if not math.isfinite(steps):
         raise call.fail("has bounds or a step without meaning")

@@ -12,6 +12,9 @@ from prim.log.source import LogSource, Topic
 from prim.text import listed
 from replay.poses.transforms import TransformTree
 
+MOST_SCANNERS = 32
+"""A robot carries no more scanners; set by hand."""
+
 
 def choose_scan_topics(log: LogSource, wanted: Sequence[str]) -> tuple[list[Topic], tuple[str, ...]]:
     """Choose the topics of scans that are mapped together.
@@ -63,6 +66,8 @@ def _without_scans(log: LogSource) -> LogReadError:
 
 def _carried_by_one_robot(log: LogSource, topics: Sequence[Topic]) -> bool:
     """Return whether the scanners have frames of their own that static transforms join."""
+    if len(topics) > MOST_SCANNERS:
+        return False
     try:
         frames = [next(iter(log.decoded(topic)))[1].frame_id.lstrip("/") for topic in topics]
         tree = TransformTree.read(log, static_only=True)
