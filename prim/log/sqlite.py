@@ -75,6 +75,10 @@ class _Table:
         return np.array(self._times, np.int64)
 
 
+_DAMAGE = (sqlite3.DatabaseError, MemoryError)
+"""What SQLite raises on damaged pages: also that there is not the memory which they claim."""
+
+
 class SqliteBagReader(LogReader):
     """A file of a ROS 2 bag in SQLite that is open for reading: a :class:`prim.log.source.LogSource`.
 
@@ -191,7 +195,7 @@ class SqliteBagReader(LogReader):
         query = "SELECT SUM(CASE typeof(data) WHEN 'blob' THEN LENGTH(data) END) FROM messages NOT INDEXED"
         try:
             ((claimed,),) = self._query(query)
-        except sqlite3.DatabaseError:
+        except _DAMAGE:
             if not self._recover:
                 raise
             return
@@ -225,7 +229,7 @@ class SqliteBagReader(LogReader):
             query = f"SELECT COUNT(*), SUM(timestamp % ?), SUM(rowid % ?) FROM messages INDEXED BY {name}"
             try:
                 count, *found = self._query(query, (CHECKED, CHECKED)).fetchone()
-            except sqlite3.DatabaseError as error:
+            except _DAMAGE as error:
                 self._damage(f"its index of times cannot be read: {error}")
                 continue
             sums = [int(np.fmod(values, CHECKED).sum()) for values in (self._table.times, self._table.rows)]
@@ -281,7 +285,7 @@ class SqliteBagReader(LogReader):
             with self._translated_errors(RECOVER_HINT):
                 try:
                     found = self._query("SELECT data FROM messages WHERE rowid = ?", (int(rows[k]),)).fetchone()
-                except sqlite3.DatabaseError as error:
+                except _DAMAGE as error:
                     if not self._recover:
                         raise
                     self._damage(f"messages in damaged pages of the database: {error}")
@@ -307,7 +311,7 @@ class SqliteBagReader(LogReader):
                 if limit < 0:
                     return
                 limit = -1  # the last row before the damage was read by itself
-            except sqlite3.DatabaseError as error:
+            except _DAMAGE as error:
                 if self._takes_too_long:
                     raise
                 self._damage(f"messages in damaged pages of the database: {error}")
@@ -318,10 +322,11 @@ class SqliteBagReader(LogReader):
         """Turn what SQLite raises into a LogReadError."""
         try:
             yield
-        except sqlite3.DatabaseError as error:
+        except _DAMAGE as error:
             if self._takes_too_long:
                 what = f"a query of its {self._data_bytes} bytes takes too many steps"
                 raise LogReadError(self.path, f"damaged, or no ROS 2 bag: {what}") from error
-            raise LogReadError(self.path, f"damaged, or no ROS 2 bag: {error}", hint) from error
+            what = str(error) or "its pages claim more memory than there is"
+            raise LogReadError(self.path, f"damaged, or no ROS 2 bag: {what}", hint) from error
         except (OSError, UnicodeDecodeError) as error:
             raise LogReadError(self.path, f"cannot be read: {getattr(error, 'strerror', None) or error}") from error
