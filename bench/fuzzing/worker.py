@@ -28,7 +28,7 @@ Command = Callable[[list[str]], int]
 OUTPUTS = {"--map": "out/m", "--trajectory": "out/t.tum", "--report": "out/r.json"}
 COMPARED = ("m.pgm", "t.tum")
 PRINTED = 1 << 26
-"""So much of what is printed is looked at (bytes)."""
+"""So much of what is printed is judged (bytes)."""
 KILOBYTE = 1024
 """The unit of Linux's figures of memory (bytes)."""
 HEADROOM = 1024.0

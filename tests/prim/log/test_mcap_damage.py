@@ -298,3 +298,15 @@ def test_zeros_over_an_attachment_and_its_crc_are_damage(tmp_path: Path) -> None
         damaged.attachment("world.json")
     with open_log(path, recover=True) as recovered:
         assert recovered.attachment("world.json") is None and recovered.lost
+
+
+def test_an_index_of_messages_that_is_gone_is_missed(tmp_path: Path) -> None:
+    """Without a summary it is all that says what a chunk holds."""
+    bare = {"use_statistics": False, "repeat_channels": False, "repeat_schemas": False, "use_summary_offsets": False}
+    path = written(tmp_path / "a.mcap", index_types=IndexType.MESSAGE, **bare)
+    with path.open("rb") as stream:
+        block = Surveyor(stream, False, []).survey().blocks[1]
+    data, index = path.read_bytes(), min(block.index.values())
+    path.write_bytes(data[: index.at] + data[index.entries + 16 * index.messages :])
+    with pytest.raises(LogReadError, match=r"its index counts other messages than it holds.*--recover"):
+        stored(path)

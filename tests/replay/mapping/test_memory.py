@@ -6,9 +6,14 @@ import pytest
 
 from mapping.grid import GridFrame
 from prim.errors import LogReadError, UsageError
+from prim.log import open_log
 from prim.memory import machine_memory
 from replay.mapping.memory import MemoryBudget
 from replay.options import ReplayOptions
+from replay.pipeline import Pipeline
+from replay.scans.scan_log import ScanLog
+from tests.encodings.ros2 import write_mcap
+from tests.prim.log.small_log import small_log
 
 FRAME = GridFrame(0.01, 0, 0, 1000, 1000)
 
@@ -45,3 +50,15 @@ def test_half_of_the_machine_is_allowed() -> None:
 def test_no_memory_is_no_option() -> None:
     with pytest.raises(UsageError, match="--max-memory is 0"):
         ReplayOptions(max_memory=0.0)
+
+
+def test_a_replay_is_refused_before_its_first_scan(tmp_path: Path) -> None:
+    path = write_mcap(small_log(scans=40), tmp_path)
+    seen: list[int] = []
+    options = ReplayOptions(mapper="forward", standing_still=True, resolution=0.05, max_memory=0.30135)
+    pipeline = Pipeline(path, options, progress=lambda done, total: seen.append(done))
+    with open_log(path) as log:
+        assert ScanLog(log, options.selection).expected_rays == 40 * 180
+    with pytest.raises(LogReadError, match="--max-memory"):
+        pipeline.run()
+    assert seen == []
