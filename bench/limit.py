@@ -23,8 +23,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from detect.refinement.geometry import JACOBIANS, parameters_of, ranges_to, shape_ranges
-from detect.refinement.rays import RayBundle, collect_rays
+from detect.refinement.likelihood.geometry import JACOBIANS, parameters_of, ranges_to, shape_ranges
+from detect.refinement.likelihood.rays import RayBundle, collect_rays
 from prim.arrays import FloatArray
 from prim.raycast import cast_segments
 from prim.scan import Scan
@@ -131,7 +131,7 @@ class Scene:
 
     @property
     def tie(self) -> FloatArray:
-        """The matrix (5, K) from the kind's own parameters to all five: see detect.refinement.geometry.JACOBIANS."""
+        """The matrix (5, K) from the kind's own parameters to all five: JACOBIANS of likelihood.geometry."""
         return JACOBIANS[self.primitive.kind]
 
     def ranges(self, at: FloatArray) -> FloatArray:

@@ -28,6 +28,7 @@ class Detection:
         covariance: (K, K) of the parameters in the kind's order (m, rad); None where nothing was refined. ``std`` has
             the square roots of its diagonal.
         since: Stamp (ns) of the scan from which on it stands there, by which it is refined; None for all scans.
+        other_probability: Posterior probability that it is none of the kinds: the kinds' and this sum to 1.
     """
 
     primitive: Primitive
@@ -37,6 +38,28 @@ class Detection:
     std: Mapping[str, float] | None = None
     kind_probabilities: Mapping[Kind, float] | None = None
     covariance: FloatArray | None = None
+    since: int | None = None
+    other_probability: float = 0.0
+
+
+@dataclass(frozen=True, eq=False)
+class UnknownObject:
+    """Something that is likeliest none of the kinds: a shape of its own, or a part of something larger.
+
+    Attributes:
+        outline: Vertices (N, 2) of a closed outline in m, map frame, counter-clockwise; not always convex.
+        std: Standard deviation of the outline (m), across it: the root mean square over the part that rays met.
+        score: Posterior probability that it is none of the kinds, 0 to 1.
+        reason: Why, in words and numbers.
+        kind_probabilities: Posterior probabilities of the kinds; with the score they sum to 1.
+        since: As Detection.since.
+    """
+
+    outline: FloatArray
+    std: float
+    score: float
+    reason: str
+    kind_probabilities: Mapping[Kind, float]
     since: int | None = None
 
 
@@ -70,8 +93,10 @@ class Detections:
         rejected: Rejected candidates in descending order of score.
         doubtful: Candidates that were rejected for their score alone, with their rejections (which are in
             ``rejected`` too): refinement decides about them.
+        objects: What is likeliest none of the kinds, in descending order of score; refinement alone finds them.
     """
 
     found: tuple[Detection, ...]
     rejected: tuple[Rejection, ...]
     doubtful: tuple[tuple[Detection, Rejection], ...] = ()
+    objects: tuple[UnknownObject, ...] = ()

@@ -308,9 +308,9 @@ def refine(
     Raises:
         UsageError: An argument is of another kind, or the noise is not above 0.
     """
-    from detect.refinement.map_cells import MapCells
     from detect.refinement.options import DEFAULTS
     from detect.refinement.refine import Refinement, detection_of, rejection_reason
+    from detect.refinement.surroundings.map_cells import MapCells
 
     guesses, noise_std = _checked_guesses(primitives), _checked_noise(noise_std)
     if not isinstance(grid, OccupancyGrid):

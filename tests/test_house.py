@@ -27,7 +27,13 @@ ARROWS: dict[str, set[str]] = {
     "mapping": {"prim", "mapping/forward"},
     "mapping/forward": {"prim", "mapping"},
     "detect/networks": {"prim", "mapping"},
-    "detect/refinement": {"prim", "mapping", "detect"},
+    "detect/refinement/likelihood": {"prim", "mapping", "detect/refinement"},
+    "detect/refinement/surroundings": {"prim", "mapping", "detect/refinement"},
+    "detect/refinement/fitting": {"prim", "detect/refinement", "detect/refinement/likelihood"},
+    "detect/refinement": {
+        "prim", "mapping", "detect", "detect/refinement/fitting", "detect/refinement/likelihood",
+        "detect/refinement/surroundings",
+    },
     "detect": {"prim", "mapping", "detect/networks"},
     "detect/training": {
         "prim", "prim/log", "prim/log/decoding", "recorder", "mapping", "detect", "detect/networks",
@@ -39,7 +45,8 @@ ARROWS: dict[str, set[str]] = {
     "replay/scans": {"prim", "prim/log", "prim/log/decoding", "replay", "replay/poses"},
     "replay/poses": {"prim", "prim/log", "prim/log/decoding", "mapping", "mapping/forward"},
     "replay/detection": {
-        "prim", "mapping", "detect", "detect/networks", "detect/refinement", "replay", "replay/poses", "replay/scans",
+        "prim", "mapping", "detect", "detect/networks", "detect/refinement", "detect/refinement/surroundings", "replay",
+        "replay/poses", "replay/scans",
     },
     "replay/mapping": {
         "prim", "mapping", "mapping/forward", "replay", "replay/poses", "replay/scans",
@@ -50,7 +57,7 @@ ARROWS: dict[str, set[str]] = {
     },
     "replay": {
         "prim", "prim/log", "prim/log/decoding", "mapping", "mapping/forward", "detect", "detect/networks",
-        "detect/refinement", "replay/scans", "replay/detection", "replay/mapping", "replay/outputs", "replay/poses",
+        "detect/refinement", "detect/refinement/surroundings", "replay/scans", "replay/detection", "replay/mapping", "replay/outputs", "replay/poses",
         "replay/viewing",
     },
 }  # fmt: skip
@@ -66,6 +73,11 @@ NARROW = {
 
 ENDS = {
     ("detect/refinement", "detect"): {"detection"},
+    ("detect/refinement/likelihood", "detect/refinement"): {"options"},
+    ("detect/refinement/surroundings", "detect/refinement"): {"options"},
+    ("detect/refinement/fitting", "detect/refinement"): {"options"},
+    ("replay/detection", "detect/refinement/surroundings"): {"map_cells"},
+    ("replay", "detect/refinement/surroundings"): {"map_cells"},
     ("replay/viewing", "replay"): {"result"},
     ("replay/viewing", "replay/outputs"): {"report"},
     ("replay/scans", "replay"): {"notes", "timing"},
@@ -88,8 +100,8 @@ OF_TUPLES = ("_replace", "_make", "_asdict", "_fields")
 NAMES_KINDS = {
     "prim/shapes.py": "the table itself",
     "detect/evaluation/paper.py": "the paper's tables",
-    "detect/refinement/proposals.py": "proposes rectangles",
-    "detect/refinement/walls.py": "a stretch of a wall is a thin rectangle",
+    "detect/refinement/surroundings/proposals.py": "proposes rectangles",
+    "detect/refinement/surroundings/walls.py": "a stretch of a wall is a thin rectangle",
 }
 """Files that name a kind, and why."""
 

@@ -40,7 +40,7 @@ REFINE_FROM_ROUGH_STARTS = """
 import json, math
 from dataclasses import replace
 import numpy as np
-from detect.refinement.map_cells import MapCells
+from detect.refinement.surroundings.map_cells import MapCells
 from detect.refinement.refine import Refinement
 from prim.shapes import Kind, Primitive, angle_error
 from tests.detect.refinement.rooms import mapped, room, scans
@@ -103,8 +103,8 @@ for preset in PRESETS.values():
 
 FIT_SQUARES = """
 import numpy as np
-from detect.refinement import kernels
-from detect.refinement.geometry import NUMBERS, OUTLINES
+from detect.refinement.likelihood import kernels
+from detect.refinement.likelihood.geometry import NUMBERS, OUTLINES
 from prim.shapes import Kind
 rays = np.zeros((7, 1))
 rays[:4, 0] = -1.0, 0.0, 1.0, 0.0

@@ -5,7 +5,7 @@ from prim.lazy import lazy_exports
 __all__, __getattr__, __dir__ = lazy_exports(
     __name__,
     {
-        "MapCells": "detect.refinement.map_cells",
+        "MapCells": "detect.refinement.surroundings.map_cells",
         "RefinementOptions": "detect.refinement.options",
         "RefinedPrimitive": "detect.refinement.refine",
         "Refinement": "detect.refinement.refine",

@@ -11,20 +11,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from detect.detection import Detection
-from detect.refinement.evidence import laplace_evidence, max_size
-from detect.refinement.fit import SPECIAL_CASES, KindFit, fit_all_kinds, refit, refit_same_kind
-from detect.refinement.geometry import JACOBIANS, parameters_of, primitive_of
-from detect.refinement.map_cells import MapCells
-from detect.refinement.options import DEFAULTS, RefinementOptions
-from detect.refinement.rays import RayBundle
-from detect.refinement.sensor_model import (
+from detect.refinement.fitting.evidence import laplace_evidence, max_size
+from detect.refinement.fitting.fit import SPECIAL_CASES, KindFit, fit_all_kinds, refit, refit_same_kind
+from detect.refinement.likelihood.geometry import JACOBIANS, parameters_of, primitive_of
+from detect.refinement.likelihood.rays import RayBundle
+from detect.refinement.likelihood.sensor_model import (
     Background,
     BeamModel,
     DistanceMap,
     background_log_likelihood,
     with_background,
 )
-from detect.refinement.walls import Wall, walls_behind
+from detect.refinement.options import DEFAULTS, RefinementOptions
+from detect.refinement.surroundings.map_cells import MapCells
+from detect.refinement.surroundings.walls import Wall, walls_behind
 from prim.arrays import FloatArray
 from prim.shapes import Primitive
 

@@ -330,6 +330,8 @@ class RefinementOptions:
     proposals: ProposalOptions = field(default_factory=ProposalOptions)
     acceptance: AcceptanceOptions = field(default_factory=AcceptanceOptions)
     standing: StandingOptions = field(default_factory=StandingOptions)
+    closed_world: bool = False
+    """Whether all there is are the kinds and walls: nothing is held against «none of the kinds»."""
     rounds: int = 2
     """Joint fits of all candidates once duplicates are gone."""
     converged: float = 0.002

@@ -23,15 +23,15 @@ import numpy as np
 
 from detect.detection import Detection, Detections, Rejection
 from detect.refinement.candidates import Candidate, find_backgrounds, fit_candidates
-from detect.refinement.evidence import compare_kinds
-from detect.refinement.geometry import parameters_of, ranges_to
-from detect.refinement.kernels import BACKGROUND, OCCLUSION
-from detect.refinement.map_cells import MapCells
+from detect.refinement.fitting.evidence import compare_kinds
+from detect.refinement.likelihood.geometry import parameters_of, ranges_to
+from detect.refinement.likelihood.kernels import BACKGROUND, OCCLUSION
+from detect.refinement.likelihood.rays import RayBundle, collect_rays
+from detect.refinement.likelihood.sensor_model import Background, BeamModel, DistanceMap, surface_likelihood
 from detect.refinement.options import DEFAULTS, AcceptanceOptions, RefinementOptions
-from detect.refinement.proposals import propose
-from detect.refinement.rays import RayBundle, collect_rays
 from detect.refinement.sensor_estimation import estimate_noise, estimate_sensor, initial_noise
-from detect.refinement.sensor_model import Background, BeamModel, DistanceMap, surface_likelihood
+from detect.refinement.surroundings.map_cells import MapCells
+from detect.refinement.surroundings.proposals import propose
 from mapping.grid import OccupancyGrid
 from prim.arrays import FloatArray
 from prim.metrics import overlap_coefficient

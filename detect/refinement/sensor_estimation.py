@@ -10,12 +10,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from detect.refinement.candidates import Candidate
-from detect.refinement.evidence import exact_costs
-from detect.refinement.geometry import JACOBIANS, NUMBERS, OUTLINES, ranges_to
-from detect.refinement.kernels import MEASURED, OCCLUSION, PARAMETERS, RANGE, gradient, upper_tail
+from detect.refinement.fitting.evidence import exact_costs
+from detect.refinement.likelihood.geometry import JACOBIANS, NUMBERS, OUTLINES, ranges_to
+from detect.refinement.likelihood.kernels import MEASURED, OCCLUSION, PARAMETERS, RANGE, gradient, upper_tail
+from detect.refinement.likelihood.rays import RayBundle
+from detect.refinement.likelihood.sensor_model import BeamModel, table_nearest
 from detect.refinement.options import DEFAULTS, SensorOptions
-from detect.refinement.rays import RayBundle
-from detect.refinement.sensor_model import BeamModel, table_nearest
 from prim import linear_algebra
 from prim.arrays import FloatArray
 from prim.normal import NORMAL_MAD

@@ -17,14 +17,14 @@ import numpy as np
 
 from detect.detection import Detection
 from detect.refinement.candidates import Candidate, find_backgrounds
-from detect.refinement.evidence import exact_costs
-from detect.refinement.fit import refit_same_kind
-from detect.refinement.geometry import parameters_of, primitive_of
-from detect.refinement.kernels import BACKGROUND
-from detect.refinement.map_cells import MapCells
+from detect.refinement.fitting.evidence import exact_costs
+from detect.refinement.fitting.fit import refit_same_kind
+from detect.refinement.likelihood.geometry import parameters_of, primitive_of
+from detect.refinement.likelihood.kernels import BACKGROUND
+from detect.refinement.likelihood.rays import collect_rays
+from detect.refinement.likelihood.sensor_model import BeamModel
 from detect.refinement.options import DEFAULTS, RefinementOptions, StandingOptions
-from detect.refinement.rays import collect_rays
-from detect.refinement.sensor_model import BeamModel
+from detect.refinement.surroundings.map_cells import MapCells
 from prim.scan import Scan
 from prim.se2 import Pose2D
 from prim.shapes import Primitive, angle_error

@@ -13,10 +13,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from detect.detection import Detection
-from detect.refinement.map_cells import MapCells
 from detect.refinement.options import DEFAULTS as REFINEMENT
 from detect.refinement.options import StandingOptions
 from detect.refinement.standing import Verdict, judge_places
+from detect.refinement.surroundings.map_cells import MapCells
 from prim.arrays import FloatArray
 from prim.scan import Scan
 from prim.se2 import Pose2D, angle_difference

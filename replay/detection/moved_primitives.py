@@ -17,9 +17,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from detect.detection import Detection, Detections, Rejection
-from detect.refinement.map_cells import MapCells
 from detect.refinement.refine import Effort, WarmStart, refine_detections
 from detect.refinement.standing import Judgement, Verdict, judge_places
+from detect.refinement.surroundings.map_cells import MapCells
 from mapping.grid import UNKNOWN, OccupancyGrid
 from prim.metrics import overlap_coefficient
 from prim.scan import Scan

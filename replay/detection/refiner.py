@@ -17,8 +17,8 @@ from prim.threads import cores
 
 if TYPE_CHECKING:
     from detect.detection import Detection, Detections
-    from detect.refinement.map_cells import MapCells
     from detect.refinement.refine import Effort
+    from detect.refinement.surroundings.map_cells import MapCells
     from replay.detection.moved_primitives import MovedPrimitives
 
 
@@ -176,8 +176,8 @@ class DetectionRefiner:
         Returns:
             The refined detections and the range noise (m), None where no ray passes any of them.
         """
-        from detect.refinement.map_cells import MapCells
         from detect.refinement.refine import Effort, WarmStart
+        from detect.refinement.surroundings.map_cells import MapCells
 
         search_kinds = self._scans.total >= self._options.kind_search_growth * self._kind_search_at
         if search_kinds:
@@ -209,8 +209,8 @@ class DetectionRefiner:
         Returns:
             The refined detections and the range noise (m), None where no ray passes any of them.
         """
-        from detect.refinement.map_cells import MapCells
         from detect.refinement.refine import THOROUGH
+        from detect.refinement.surroundings.map_cells import MapCells
 
         cells = MapCells.of(grid)
         refined, noise_std = self._refine(detections, grid, cells, scans(), THOROUGH)

@@ -13,14 +13,17 @@ from hypothesis import strategies as st
 
 from detect.detection import Detection, Detections, Rejection
 from detect.refinement.candidates import Candidate, find_backgrounds, fit_candidates
-from detect.refinement.evidence import exact_costs
-from detect.refinement.fit import KindFit, other_apexes, refit, starts
-from detect.refinement.geometry import JACOBIANS, parameters_of, primitive_of
-from detect.refinement.lines import find_lines
-from detect.refinement.map_cells import MapCells, OneSidedWall, is_within
+from detect.refinement.fitting.evidence import exact_costs
+from detect.refinement.fitting.fit import KindFit, other_apexes, refit, starts
+from detect.refinement.likelihood.geometry import JACOBIANS, parameters_of, primitive_of
+from detect.refinement.likelihood.rays import RayBundle, RayCollector, collect_rays
+from detect.refinement.likelihood.sensor_model import (
+    BeamModel,
+    DistanceMap,
+    background_log_likelihood,
+    with_background,
+)
 from detect.refinement.options import DEFAULTS
-from detect.refinement.proposals import propose
-from detect.refinement.rays import RayBundle, RayCollector, collect_rays
 from detect.refinement.refine import (
     Effort,
     RefinedPrimitive,
@@ -29,12 +32,9 @@ from detect.refinement.refine import (
     refine_detections,
     rejection_reason,
 )
-from detect.refinement.sensor_model import (
-    BeamModel,
-    DistanceMap,
-    background_log_likelihood,
-    with_background,
-)
+from detect.refinement.surroundings.lines import find_lines
+from detect.refinement.surroundings.map_cells import MapCells, OneSidedWall, is_within
+from detect.refinement.surroundings.proposals import propose
 from mapping.grid import GridFrame, OccupancyGrid
 from prim.metrics import polygon_iou
 from prim.scan import Scan

@@ -12,10 +12,10 @@ import numpy as np
 import pytest
 
 from detect.detection import Detection, Detections
-from detect.refinement.map_cells import MapCells
-from detect.refinement.rays import collect_rays
+from detect.refinement.likelihood.rays import collect_rays
 from detect.refinement.refine import Effort, refine_detections
 from detect.refinement.standing import Verdict, judge_places
+from detect.refinement.surroundings.map_cells import MapCells
 from mapping.grid import OccupancyGrid
 from mapping.mapper import make_mapper
 from prim.scan import Scan

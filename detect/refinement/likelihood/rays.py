@@ -9,8 +9,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from detect.refinement.geometry import passes_within
-from detect.refinement.kernels import (
+from detect.refinement.likelihood.geometry import passes_within
+from detect.refinement.likelihood.kernels import (
     BACKGROUND,
     COLLECTED_ROWS,
     ENTRY_RANGE,
@@ -38,7 +38,7 @@ class RayBundle:
     """N rays that pass one candidate.
 
     Attributes:
-        rays: (7, N) as detect.refinement.kernels has them.
+        rays: (7, N) as detect.refinement.likelihood.kernels has them.
         outcomes: (N,) MEASURED, TOO_NEAR or NO_RETURN.
         entry_range: (N,) range (m) at which they enter the candidate's circle.
         max_range: (N,) the sensor's (m).

@@ -10,7 +10,7 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from detect.refinement.evidence import (
+from detect.refinement.fitting.evidence import (
     KindPosterior,
     _merged_special_cases,
     compare_kinds,
@@ -18,11 +18,11 @@ from detect.refinement.evidence import (
     log_prior,
     max_size,
 )
-from detect.refinement.fit import SPECIAL_CASES, KindFit
-from detect.refinement.geometry import JACOBIANS
+from detect.refinement.fitting.fit import SPECIAL_CASES, KindFit
+from detect.refinement.likelihood.geometry import JACOBIANS
+from detect.refinement.likelihood.rays import RayBundle
+from detect.refinement.likelihood.sensor_model import BeamModel
 from detect.refinement.options import DEFAULTS
-from detect.refinement.rays import RayBundle
-from detect.refinement.sensor_model import BeamModel
 from prim.shapes import Kind, Primitive
 
 

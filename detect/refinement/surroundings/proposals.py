@@ -12,8 +12,8 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from detect.refinement.map_cells import MapCells, is_within
 from detect.refinement.options import DEFAULTS, ProposalOptions
+from detect.refinement.surroundings.map_cells import MapCells, is_within
 from mapping.morphology import dilate
 from prim import linear_algebra
 from prim.arrays import FloatArray

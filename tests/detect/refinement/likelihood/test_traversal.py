@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from detect.refinement.traversal import cast_through_map
+from detect.refinement.likelihood.traversal import cast_through_map
 from mapping.morphology import chessboard_distances
 
 

@@ -10,8 +10,8 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from detect.refinement.lines import Line, distance_to_line, find_lines, trimmed_line
 from detect.refinement.options import DEFAULTS, LineOptions, MapOptions
+from detect.refinement.surroundings.lines import Line, distance_to_line, find_lines, trimmed_line
 from mapping.grid import GridFrame, OccupancyGrid
 from mapping.morphology import beside_free, connected_components, dilate
 from prim.arrays import BoolGrid, FloatArray

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from detect.refinement.kernels import (
+from detect.refinement.likelihood.kernels import (
     FORMS,
     PARAMETERS,
     POLYGON,
@@ -83,7 +83,7 @@ def shape_ranges(kind: Kind, p: FloatArray, rays: FloatArray) -> FloatArray:
     Args:
         kind: Its kind.
         p: (5,) its parameters.
-        rays: (7, N) as detect.refinement.kernels has them.
+        rays: (7, N) as detect.refinement.likelihood.kernels has them.
 
     Returns:
         The ranges (N,) in metres; FAR for a miss, 0 from inside.

@@ -20,18 +20,18 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-from detect.refinement.fit import SPECIAL_CASES, KindFit
-from detect.refinement.geometry import JACOBIANS, NUMBERS, OUTLINES, primitive_of
-from detect.refinement.kernels import (
+from detect.refinement.fitting.fit import SPECIAL_CASES, KindFit
+from detect.refinement.likelihood.geometry import JACOBIANS, NUMBERS, OUTLINES, primitive_of
+from detect.refinement.likelihood.kernels import (
     BACKGROUND,
     PARAMETERS,
     gradient,
     negative_log_likelihoods,
     standardized_clearances,
 )
+from detect.refinement.likelihood.rays import RayBundle
+from detect.refinement.likelihood.sensor_model import BeamModel
 from detect.refinement.options import DEFAULTS, EvidenceOptions
-from detect.refinement.rays import RayBundle
-from detect.refinement.sensor_model import BeamModel
 from prim import linear_algebra
 from prim.arrays import FloatArray
 from prim.se2 import MAX_COORDINATE

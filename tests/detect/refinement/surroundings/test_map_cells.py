@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from detect.refinement.lines import distance_to_line, trimmed_line
-from detect.refinement.map_cells import MapCells
+from detect.refinement.surroundings.lines import distance_to_line, trimmed_line
+from detect.refinement.surroundings.map_cells import MapCells
 from mapping.grid import GridFrame, OccupancyGrid
 from tests.detect.refinement.rooms import mapped, room, scans
 

@@ -14,7 +14,7 @@ from prim.compiled import compiled
 kernel = compiled(inline="never", fastmath={"arcp", "contract", "reassoc", "nsz"})
 
 ORIGIN_X, ORIGIN_Y, DIRECTION_X, DIRECTION_Y = range(4)
-"""Rows of rays (7, N), as in detect.refinement.kernels."""
+"""Rows of rays (7, N), as in detect.refinement.likelihood.kernels."""
 
 FAR = 1e30
 

@@ -14,11 +14,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from detect.refinement.geometry import JACOBIANS, NUMBERS, OUTLINES, parameters_of
-from detect.refinement.kernels import PARAMETERS, Schedule, Starts, descend, negative_log_likelihoods
+from detect.refinement.likelihood.geometry import JACOBIANS, NUMBERS, OUTLINES, parameters_of
+from detect.refinement.likelihood.kernels import PARAMETERS, Schedule, Starts, descend, negative_log_likelihoods
+from detect.refinement.likelihood.rays import RayBundle
+from detect.refinement.likelihood.sensor_model import BeamModel
 from detect.refinement.options import DEFAULTS, Descent, FitOptions
-from detect.refinement.rays import RayBundle
-from detect.refinement.sensor_model import BeamModel
 from prim.arrays import FloatArray
 from prim.shapes import Kind, Primitive
 

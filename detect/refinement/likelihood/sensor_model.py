@@ -27,8 +27,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from detect.refinement.geometry import NUMBERS, OUTLINES, parameters_of
-from detect.refinement.kernels import (
+from detect.refinement.likelihood.geometry import NUMBERS, OUTLINES, parameters_of
+from detect.refinement.likelihood.kernels import (
     BACKGROUND,
     FAR,
     MEASURED,
@@ -41,9 +41,9 @@ from detect.refinement.kernels import (
     likelihood_table,
     occlude,
 )
+from detect.refinement.likelihood.rays import RayBundle
+from detect.refinement.likelihood.traversal import cast_through_map
 from detect.refinement.options import DEFAULTS, SensorOptions
-from detect.refinement.rays import RayBundle
-from detect.refinement.traversal import cast_through_map
 from mapping.grid import GridFrame
 from mapping.morphology import chessboard_distances
 from prim.arrays import FloatArray
@@ -57,7 +57,7 @@ class BeamModel:
     Attributes:
         std: Range noise (m).
         span: range_max - range_min (m).
-        table: Log-likelihoods (6, T) of :func:`detect.refinement.kernels.likelihood_table`.
+        table: Log-likelihoods (6, T) of :func:`detect.refinement.likelihood.kernels.likelihood_table`.
         footprint: Half the width (m) over which a beam that passes an edge may meet it or not: the beam's own width
             and the errors of poses and bearings.
         dispersion: The factor by which squared errors of whole scans exceed those of independent rays; 1 where poses
@@ -212,7 +212,7 @@ def table_nearest(table: FloatArray, outcomes: NDArray[np.int8], x: FloatArray) 
     """Look up log-likelihoods without interpolation.
 
     Args:
-        table: Of :func:`detect.refinement.kernels.likelihood_table`.
+        table: Of :func:`detect.refinement.likelihood.kernels.likelihood_table`.
         outcomes: (N,) rows.
         x: (N,) residuals in standard deviations.
 

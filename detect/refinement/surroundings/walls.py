@@ -13,9 +13,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from detect.refinement.lines import Line, distance_to_line, find_lines, trimmed_line
-from detect.refinement.map_cells import OUTLINE_POINTS, MapCells, is_within
 from detect.refinement.options import DEFAULTS, LineOptions, WallOptions
+from detect.refinement.surroundings.lines import Line, distance_to_line, find_lines, trimmed_line
+from detect.refinement.surroundings.map_cells import OUTLINE_POINTS, MapCells, is_within
 from prim.arrays import FloatArray
 from prim.shapes import Kind, Primitive
 

@@ -10,8 +10,8 @@ import shapely
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from detect.refinement import kernels
-from detect.refinement.geometry import NUMBERS, OUTLINES, parameters_of, ranges_to
+from detect.refinement.likelihood import kernels
+from detect.refinement.likelihood.geometry import NUMBERS, OUTLINES, parameters_of, ranges_to
 from prim.arrays import FloatArray
 from prim.scan import RangeOutcome
 from prim.shapes import Kind, Primitive
