@@ -45,8 +45,8 @@ ARROWS: dict[str, set[str]] = {
     "replay/scans": {"prim", "prim/log", "prim/log/decoding", "replay", "replay/poses"},
     "replay/poses": {"prim", "prim/log", "prim/log/decoding", "mapping", "mapping/forward"},
     "replay/detection": {
-        "prim", "mapping", "detect", "detect/networks", "detect/refinement", "detect/refinement/surroundings", "replay",
-        "replay/poses", "replay/scans",
+        "prim", "mapping", "detect", "detect/networks", "detect/refinement", "detect/refinement/surroundings",
+        "replay", "replay/poses", "replay/scans",
     },
     "replay/mapping": {
         "prim", "mapping", "mapping/forward", "replay", "replay/poses", "replay/scans",
@@ -57,7 +57,8 @@ ARROWS: dict[str, set[str]] = {
     },
     "replay": {
         "prim", "prim/log", "prim/log/decoding", "mapping", "mapping/forward", "detect", "detect/networks",
-        "detect/refinement", "detect/refinement/surroundings", "replay/scans", "replay/detection", "replay/mapping", "replay/outputs", "replay/poses",
+        "detect/refinement", "detect/refinement/surroundings", "replay/scans", "replay/detection", "replay/mapping",
+        "replay/outputs", "replay/poses",
         "replay/viewing",
     },
 }  # fmt: skip
