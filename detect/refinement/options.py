@@ -407,6 +407,8 @@ class ContactOptions:
     """m; a wall those this near to its line,"""
     wall_width_cells: float = 1.6
     """cells; or this near."""
+    wall_extension: float = 0.2
+    """m; a wall may go on so far behind a candidate, beyond where it is seen."""
     wall_depth: float = 0.02
     """m; a candidate that reaches further behind a wall's line is not explained by it,"""
     wall_depth_cells: float = 0.4
@@ -421,6 +423,16 @@ class ContactOptions:
     """m; cells this near to primitives are theirs."""
     passing: float = 0.002
     """m; rays whose line passes a candidate by more count."""
+    side_strip: tuple[float, ...] = (0.5, 1.5, 2.5, 3.5)
+    """cells; distances from a side at which free cells are sought beside it,"""
+    side_ends: float = 2.0
+    """cells; its ends left out,"""
+    side_cells: int = 4
+    """cells; where so many are left."""
+    flush_wall: float = 1.5
+    """cells; what lies this near to a wall's line is the wall's, where no ray saw it."""
+    flush_share: float = 0.8
+    """Share of a side beside which no cell is free, and another thing's cells are, where it is flush with that."""
     min_nats: float = 20.0
     """nats; what touches a candidate makes it a part where the rays are likelier with it by more. Primitives that
     stand alone or at walls come to 1 at most (trial of 331 and 114)."""
@@ -438,6 +450,9 @@ class OtherOptions:
     polygon_handicap: float = 5.0
     """nats; by which polygons are less likely a priori than deformed primitives: their number of vertices is chosen
     by the same rays."""
+    flush: float = 1.0
+    """Odds that a thing with a side flush with a wall, or with another thing, is a part of it: a free-standing one
+    seldom stands so exactly, parts always do, and the rays cannot tell them apart."""
     min_gain: float = 5.0
     """nats; only where the score test promises a gain of so much are free outlines fitted."""
 

@@ -20,7 +20,7 @@ from detect.refinement.likelihood.geometry import primitive_of
 from detect.refinement.likelihood.rays import RayBundle
 from detect.refinement.likelihood.sensor_model import BeamModel
 from detect.refinement.options import DEFAULTS, OtherOptions
-from detect.refinement.outlines.contact import contact_of
+from detect.refinement.outlines.contact import contact_of, is_flush
 from detect.refinement.outlines.free_outline import OutlineCost, StarOutline, fit_free_outline, score_test
 from detect.refinement.outlines.polygons import contour_of, fit_polygons, polygon_starts
 from prim.arrays import FloatArray
@@ -103,9 +103,9 @@ def _polygon(
     return Alternative(fit.vertices, log_odds, fit.std, reason)
 
 
-def larger_alternative(
+def larger_alternatives(
     candidate: Candidate, primitive: Primitive, others: Sequence[Primitive], sensor: BeamModel
-) -> Alternative | None:
+) -> list[Alternative]:
     """Ask whether a candidate is a part of something larger.
 
     Args:
@@ -115,16 +115,22 @@ def larger_alternative(
         sensor: The sensor.
 
     Returns:
-        The hypothesis; None where nothing unexplained touches the candidate.
+        The hypotheses; none where nothing unexplained touches the candidate, and no side of it is flush with what is
+        beside it.
     """
-    options = candidate.options.contact
-    contact = contact_of(primitive, candidate.fitted_rays, candidate.cells, others, candidate.walls, sensor, options)
-    if not contact.cells:
-        return None
-    reason = (
-        f"it is a part of something larger: its rays are likelier by {contact.nats:.0f} nats with what touches it"
+    options = candidate.options
+    outline, found = primitive.outline(), []
+    contact = contact_of(
+        primitive, candidate.fitted_rays, candidate.cells, others, candidate.walls, sensor, options.contact
     )
-    return Alternative(primitive.outline(), contact.nats - options.min_nats, 0.0, reason)
+    if contact.cells:
+        nats = contact.nats
+        reason = f"a part of something larger: its rays are likelier by {nats:.0f} nats with what touches it"
+        found.append(Alternative(outline, nats - options.contact.min_nats, 0.0, reason))
+    if is_flush(primitive, candidate.cells, others, options.contact):
+        reason = "one side is flush with what is beside it: as likely a part of that"
+        found.append(Alternative(outline, math.log(options.other.flush / len(Kind)), 0.0, reason))
+    return found
 
 
 def other_log_odds(

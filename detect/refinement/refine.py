@@ -33,7 +33,7 @@ from detect.refinement.options import DEFAULTS, AcceptanceOptions, OtherOptions,
 from detect.refinement.other import (
     Alternative,
     free_alternatives,
-    larger_alternative,
+    larger_alternatives,
     other_log_odds,
     simple_outline,
 )
@@ -457,13 +457,12 @@ class Refinement:
         }
         rest = [one for one in asked if id(one) in kept]
 
-        def larger(one: Candidate) -> Alternative | None:
+        def larger(one: Candidate) -> list[Alternative]:
             others = [primitive for key, primitive in kept.items() if key != id(one)]
-            return larger_alternative(one, kept[id(one)], others, sensor)
+            return larger_alternatives(one, kept[id(one)], others, sensor)
 
-        for one, alternative in zip(rest, pool.map(larger, rest), strict=True):
-            if alternative is not None:
-                beside[id(one)] = _required(results[id(one)]).beside([*shapes[id(one)], alternative], other)
+        for one, parts in zip(rest, pool.map(larger, rest), strict=True):
+            beside[id(one)] = _required(results[id(one)]).beside([*shapes[id(one)], *parts], other)
         return beside
 
     def _near_rays(self, candidates: list[Candidate]) -> list[Candidate]:
