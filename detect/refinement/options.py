@@ -116,6 +116,12 @@ class FitOptions:
     """nats; nor is another fit of one kind."""
     starts_kept: int = 2
     """Coarse fits of a kind that are continued."""
+    same_mode: float = 4.0
+    """Standard deviations of either within which two fits are of one mode: the evidence's samples reach as far."""
+    mode_cost_margin: float = 20.0
+    """nats; a mode that is less likely by this much than the best one of its kind is left out."""
+    modes_kept: int = 4
+    """Modes of a kind that are kept. Bounds the time."""
     equilateral: float = 1.3
     """A triangle whose sides differ by a smaller factor may have been fitted with the wrong apex."""
     stretch: float = 1.03
@@ -150,8 +156,15 @@ class EvidenceOptions:
     """m; the prior of sizes is uniform up to this extent: twice the recorder's largest (0.32 m), and some."""
     contender: float = 7.0
     """nats; kinds within this of the best one's Laplace approximation are sampled: e^-7 is below 0.1 %."""
+    mode_margin: float = 9.0
+    """nats; and of each of these kinds the modes within this of its best one: as before, and what Laplace's
+    approximation of one kind's modes is off by."""
     samples: tuple[int, ...] = (300, 300, 600)
     """Samples in each round."""
+    more_samples: tuple[int, ...] = (1200, 2400)
+    """Samples in each further round, of which there are as many as it takes until …"""
+    enough_effective: float = 60.0
+    """… the effective sample size of a round is this: else the posterior of rough likelihoods comes out too narrow."""
     degrees: float = 6.0
     """Degrees of freedom of the proposal, Student's t: heavier tails than the posterior's."""
     min_effective: float = 0.15
