@@ -122,6 +122,11 @@ class FitOptions:
     """nats; a mode that is less likely by this much than the best one of its kind is left out."""
     modes_kept: int = 4
     """Modes of a kind that are kept. Bounds the time."""
+    scattered: int = 200
+    scatter: float = 4.0
+    scatter_blur: float = 0.004
+    scatter_kept: int = 2
+    scatter_cost_margin: float = 10.0
     equilateral: float = 1.3
     """A triangle whose sides differ by a smaller factor may have been fitted with the wrong apex."""
     stretch: float = 1.03
@@ -164,7 +169,7 @@ class EvidenceOptions:
     more_samples: tuple[int, ...] = (1200, 2400)
     """Samples in each further round, of which there are as many as it takes until …"""
     enough_effective: float = 60.0
-    """… the effective sample size of a round is this: else the posterior of rough likelihoods comes out too narrow."""
+    """… the effective sample size of a round is this: else the posterior of a rough likelihood is too narrow."""
     degrees: float = 6.0
     """Degrees of freedom of the proposal, Student's t: heavier tails than the posterior's."""
     min_effective: float = 0.15
@@ -223,6 +228,8 @@ class MapOptions:
     """m; occupied cells around a candidate that are its own, before it is fitted."""
     cleared: float = 0.02
     """m; and afterwards."""
+    blur: float = 0.1
+    """m; noise blurs a primitive so far into the map: connected cells this near are its own."""
     occluder_distance: float = 2.5
     """m; candidates further apart do not occlude each other: few rays pass both."""
 

@@ -15,10 +15,18 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from detect.refinement.likelihood.geometry import JACOBIANS, NUMBERS, OUTLINES, parameters_of
-from detect.refinement.likelihood.kernels import PARAMETERS, THETA, Schedule, Starts, descend, negative_log_likelihoods
+from detect.refinement.likelihood.kernels import (
+    PARAMETERS,
+    THETA,
+    Schedule,
+    Starts,
+    descend,
+    negative_log_likelihoods,
+)
 from detect.refinement.likelihood.rays import RayBundle
 from detect.refinement.likelihood.sensor_model import BeamModel
 from detect.refinement.options import DEFAULTS, Descent, FitOptions
+from prim import linear_algebra
 from prim.arrays import FloatArray
 from prim.shapes import Kind, Primitive
 
@@ -185,8 +193,38 @@ def refit(
     Returns:
         The distinct modes of each kind, the best one of a kind first.
     """
-    begin = [(fit.kind, fit.p) for fit in fits]
+    begin = [(fit.kind, fit.p) for fit in (*fits, *_scattered(fits, bundle, sensor, options))]
     return _modes_of_each_kind(begin, Subset(bundle), sensor, options.last, options)
+
+
+def _scattered(
+    fits: Sequence[KindFit], bundle: RayBundle, sensor: BeamModel, options: FitOptions
+) -> list[KindFit]:
+    """Return the likeliest of shapes that are scattered about the best fit of each likely kind, as further starts."""
+    lowest = min(fit.cost for fit in fits)
+    best = {fit.kind: fit for fit in sorted(fits, key=lambda fit: -fit.cost)}
+    chosen: list[KindFit] = []
+    for kind, fit in best.items():
+        if fit.cost > lowest + options.scatter_cost_margin:
+            continue
+        size = JACOBIANS[kind].shape[1]
+        inverse = linear_algebra.inverse(fit.information / sensor.dispersion + np.eye(size))
+        lower = None if inverse is None else linear_algebra.cholesky(options.scatter**2 * inverse)
+        if lower is None:
+            continue
+        normal = np.random.default_rng(size).standard_normal((options.scattered, size))
+        shapes = fit.p + normal @ lower.T @ JACOBIANS[kind].T
+        shapes = np.ascontiguousarray(shapes[(shapes[:, 3:] > options.min_size).all(axis=1)])
+        cost = np.empty(len(shapes))
+        numbers = np.full(len(shapes), NUMBERS[kind])
+        negative_log_likelihoods(OUTLINES, numbers, shapes, sensor.data(bundle), options.scatter_blur, cost)
+        made = [replace(fit, p=shapes[k], cost=float(cost[k])) for k in np.argsort(cost, kind="stable").tolist()]
+        own: list[KindFit] = []
+        for one in made[: options.scattered // 4]:
+            if len(own) < options.scatter_kept and not any(_is_same_mode(one, other, replace(options, same_mode=2.0)) for other in (fit, *own)):
+                own.append(one)
+        chosen += own
+    return chosen
 
 
 def refit_same_kind(
@@ -293,7 +331,8 @@ def nearest_name(kind: Kind, p: FloatArray, like: FloatArray) -> tuple[FloatArra
     reach = math.hypot(like[3], like[4]) / 2
 
     def turned(name: FloatArray) -> FloatArray:
-        return name + period * np.round((like - name) / period) * np.eye(PARAMETERS)[THETA]
+        turns = round(float(like[THETA] - name[THETA]) / period)
+        return np.asarray(name + turns * period * np.eye(PARAMETERS)[THETA])
 
     def distance(name: FloatArray) -> float:
         return math.hypot(name[3] - like[3], name[4] - like[4], reach * (name[2] - like[2]))
