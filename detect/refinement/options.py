@@ -127,7 +127,7 @@ class FitOptions:
     scatter_blur: float = 0.004
     scatter_kept: int = 2
     scatter_cost_margin: float = 10.0
-    equilateral: float = 1.3
+    equilateral: float = 2.0
     """A triangle whose sides differ by a smaller factor may have been fitted with the wrong apex."""
     stretch: float = 1.03
     """Factor by which an ellipse's start is longer (and shorter) than the circle that it begins with."""
