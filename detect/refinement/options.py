@@ -188,6 +188,10 @@ class EvidenceOptions:
     """Standard deviations within which a ray's hit or miss must not change to be summed up once."""
     same_sizes: float = 0.0005
     """m; sizes that differ by less make a square of a rectangle: no pose is known better."""
+    unseen_size: float = 0.15
+    """Relative standard deviation of a size from which on no ray has seen it,"""
+    unseen_margin: float = 3.0
+    """and nats within which a kind that does not know a size is reported in the place of its special case."""
     log_evidence_margin: float = 30.0
     """nats (times the dispersion); a kind whose evidence is less by this much is not fitted again."""
 

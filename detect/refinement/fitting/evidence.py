@@ -488,8 +488,22 @@ def compare_kinds(
         for kind in rough
     }
     kind_probabilities = {kind: weights.get(kind, 0.0) / sum(weights.values()) for kind in Kind}
+    best = next((kind for kind in SPECIAL_CASES if _is_unseen(kind, best, sampled, options)), best)
     primitive, std, covariance = summarize(best, sampled[best])
     return Posterior(primitive, std, covariance, kind_probabilities, sampled[best].cost)
+
+
+def _is_unseen(kind: Kind, best: Kind, sampled: Mapping[Kind, KindPosterior], options: EvidenceOptions) -> bool:
+    """Tell whether a kind's special case is the best only since nobody saw a side: it must not claim its size.
+
+    Then the kind itself is as likely but for its prior, and does not know a size.
+    """
+    if SPECIAL_CASES[kind] is not best or kind not in sampled:
+        return False
+    own = sampled[kind]
+    relative = np.sqrt(np.diag(own.covariance)[-2:]) / own.mean[-2:]
+    near = own.log_evidence > sampled[best].log_evidence - options.unseen_margin
+    return near and bool((relative > options.unseen_size).any())
 
 
 def _merged_special_cases(
