@@ -120,6 +120,10 @@ class FitOptions:
     """Standard deviations of either within which two fits are of one mode: the evidence's samples reach as far."""
     mode_cost_margin: float = 20.0
     """nats; a mode that is less likely by this much than the best one of its kind is left out."""
+    max_extent: float = 0.7
+    """m; EvidenceOptions.max_extent: a fit that is larger is no shape by the prior, …"""
+    too_large_nats: float = 1.0
+    """nats; … and one that is not is preferred to it where it is less likely by no more."""
     modes_kept: int = 4
     """Modes of a kind that are kept. Bounds the time."""
     scattered: int = 200

@@ -287,7 +287,12 @@ def distinct_modes(fits: Sequence[KindFit], options: FitOptions = DEFAULTS.fit) 
     Returns:
         The modes, the likeliest first.
     """
-    ordered = sorted(fits, key=lambda fit: fit.cost)
+
+    def cost(fit: KindFit) -> float:
+        """Return a fit's cost; one that no prior allows must gain something: where sizes are unseen they drift."""
+        return fit.cost + options.too_large_nats * (fit.p[3:].max() * fit.kind.extent > options.max_extent)
+
+    ordered = sorted(fits, key=cost)
     modes = ordered[:1]
     for fit in ordered[1:]:
         if len(modes) == options.modes_kept or not fit.cost < modes[0].cost + options.mode_cost_margin:
