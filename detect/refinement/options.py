@@ -126,7 +126,7 @@ class FitOptions:
     """nats; … and one that is not is preferred to it where it is less likely by no more."""
     modes_kept: int = 4
     """Modes of a kind that are kept. Bounds the time."""
-    scattered: int = 200
+    scattered: int = 100
     scatter: float = 4.0
     scatter_blur: float = 0.004
     scatter_kept: int = 2
@@ -170,7 +170,7 @@ class EvidenceOptions:
     approximation of one kind's modes is off by."""
     samples: tuple[int, ...] = (300, 300, 600)
     """Samples in each round."""
-    more_samples: tuple[int, ...] = (1200, 2400)
+    more_samples: tuple[int, ...] = (900, 1800)
     """Samples in each further round, of which there are as many as it takes until …"""
     enough_effective: float = 60.0
     """… the effective sample size of a round is this: else the posterior of a rough likelihood is too narrow."""

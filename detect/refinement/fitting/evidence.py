@@ -149,18 +149,72 @@ def importance_sample(
 
 
 @dataclass(frozen=True)
+class Anchor:
+    """Which point of a shape keeps its place as the shape turns and grows: where rays see one side only, that side.
+
+    Samples are drawn of the anchor's place in that of the centroid's. The posterior of a long, unseen size is curved
+    in the centroid's (it moves sideways as the shape turns), not in the anchor's. The volume is the same.
+
+    Attributes:
+        theta: The fit's angle (rad).
+        shares: (2,) shares of width and height that the centroid lies beyond the anchor, in the shape's own frame;
+            0 where the centroid is the anchor.
+    """
+
+    theta: float
+    shares: FloatArray
+
+    @classmethod
+    def of(cls, fit: KindFit, covariance: FloatArray, options: EvidenceOptions) -> Anchor:
+        """Find it: displacements of the centroid with sizes, by the covariance (5, 5), where these are unseen."""
+        shares = np.zeros(2)
+        turn = _rotation(np.array([fit.p[2]]))[0]
+        for axis, size in enumerate((3, 4)):
+            variance = covariance[size, size]
+            if fit.kind.has_angle and variance > (options.unseen_size * fit.p[size]) ** 2:
+                shares[axis] = np.clip(turn[:, axis] @ covariance[:2, size] / variance, -0.5, 0.5)
+        return cls(float(fit.p[2]), shares)
+
+    def moved(self, points: FloatArray, sign: float) -> FloatArray:
+        """Return points (N, K) with the centroid's place for the anchor's (``sign`` 1), or the reverse (-1)."""
+        if not self.shares.any():
+            return points
+        sizes = points[:, 3:] if points.shape[1] > 4 else np.repeat(points[:, 3:], 2, axis=1)
+        turns = _rotation(points[:, 2]) - _rotation(np.array([self.theta]))
+        moved = points.copy()
+        moved[:, :2] += sign * np.einsum("nij,nj->ni", turns, sizes * self.shares)
+        return moved
+
+    def linear(self, p: FloatArray, size: int) -> FloatArray:
+        """Return the Jacobian (K, K) of the anchor's parameters by the centroid's, at the fit's parameters (5,)."""
+        made = np.eye(size)
+        if self.shares.any():
+            cos, sin = math.cos(self.theta), math.sin(self.theta)
+            made[:2, 2] = -np.array([[-sin, -cos], [cos, -sin]]) @ (p[3:] * self.shares)
+        return made
+
+
+def _rotation(theta: FloatArray) -> FloatArray:
+    """Return the rotation matrices (N, 2, 2) of angles (N,)."""
+    cos, sin = np.cos(theta), np.sin(theta)
+    return np.stack((np.stack((cos, -sin), axis=-1), np.stack((sin, cos), axis=-1)), axis=-2)
+
+
+@dataclass(frozen=True)
 class Round:
     """Samples of one mode, drawn from Student's t.
 
     Attributes:
         split: The cost function.
+        anchor: In whose place of the centroid's the proposal is Student's t.
         mean: (K,) of the proposal.
         lower: (K, K) the Cholesky factor of its covariance's scale.
-        points: (N, K).
+        points: (N, K), by the centroid.
         log_weight: (N,) log-likelihood over the proposal's density; -inf where there is no such shape.
     """
 
     split: SplitCost
+    anchor: Anchor
     mean: FloatArray
     lower: FloatArray
     points: FloatArray
@@ -190,26 +244,30 @@ def _draw_last_round(
     impossible = KindPosterior(fit.p @ own, np.diag(floor**2), -math.inf, fit.cost)
     if inverse is None:
         return impossible
-    mean, spread = fit.p @ own, _bounded(inverse, fit.kind, floor, options)
+    spread = _bounded(inverse, fit.kind, floor, options)
     wide = jacobian @ (options.sure_deviations**2 * spread) @ jacobian.T
+    anchor = Anchor.of(fit, jacobian @ spread @ jacobian.T, options)
+    change = anchor.linear(fit.p, size)
+    mean, spread = fit.p @ own, change @ spread @ change.T if anchor.shares.any() else spread
     split = SplitCost.of(fit, wide, bundle, sensor, options)
     planned = [*options.samples, *options.more_samples]
     for number, (standard, log_density) in enumerate(_draws(size, options), start=1):
         lower = linear_algebra.cholesky(spread)
         if lower is None:
             return impossible
-        points = mean + standard @ lower.T
+        drawn = mean + standard @ lower.T
+        points = anchor.moved(drawn, 1.0)
         cost = split.costs(points @ jacobian.T)
         log_weight = -cost / sensor.dispersion - log_density + np.log(np.diag(lower)).sum()
         log_weight[~(np.isfinite(log_weight) & (np.abs(points) <= MAX_COORDINATE).all(axis=1))] = -math.inf
         if not np.isfinite(log_weight).any():
             return impossible
-        made = Round(split, mean, lower, points, log_weight)
+        made = Round(split, anchor, mean, lower, points, log_weight)
         enough = number >= len(options.samples) and made.effective >= options.enough_effective
         if enough or number == len(planned):
             break
         weight = np.exp(log_weight - log_weight.max())
-        mean, covariance = _moments(points, _tempered(weight, options.min_effective * len(weight), options))
+        mean, covariance = _moments(drawn, _tempered(weight, options.min_effective * len(weight), options))
         spread = _bounded(covariance, fit.kind, floor, options)
     return made
 
@@ -263,7 +321,7 @@ def _posteriors_of(
 
 def _log_density(one: Round, points: FloatArray, options: EvidenceOptions) -> FloatArray:
     """Return the log density (N,) at points (N, K) of the proposal that a round was drawn from."""
-    standard = np.linalg.solve(one.lower, (points - one.mean).T)
+    standard = np.linalg.solve(one.lower, (one.anchor.moved(points, -1.0) - one.mean).T)
     scale = float(np.log(np.diag(one.lower)).sum())
     return np.asarray(_log_density_of_t((standard**2).sum(axis=0), len(one.mean), options.degrees) - scale)
 

@@ -11,6 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import numpy as np
 
@@ -193,38 +194,38 @@ def refit(
     Returns:
         The distinct modes of each kind, the best one of a kind first.
     """
-    begin = [(fit.kind, fit.p) for fit in (*fits, *_scattered(fits, bundle, sensor, options))]
+    begin = [(fit.kind, fit.p) for fit in fits]
+    begin += _scattered(fits, Subset.of(bundle, options.search_rays), sensor, options)
     return _modes_of_each_kind(begin, Subset(bundle), sensor, options.last, options)
 
 
-def _scattered(
-    fits: Sequence[KindFit], bundle: RayBundle, sensor: BeamModel, options: FitOptions
-) -> list[KindFit]:
+def _scattered(fits: Sequence[KindFit], subset: Subset, sensor: BeamModel, options: FitOptions) -> list[Start]:
     """Return the likeliest of shapes that are scattered about the best fit of each likely kind, as further starts."""
     lowest = min(fit.cost for fit in fits)
     best = {fit.kind: fit for fit in sorted(fits, key=lambda fit: -fit.cost)}
-    chosen: list[KindFit] = []
-    for kind, fit in best.items():
-        if fit.cost > lowest + options.scatter_cost_margin:
-            continue
-        size = JACOBIANS[kind].shape[1]
-        inverse = linear_algebra.inverse(fit.information / sensor.dispersion + np.eye(size))
-        lower = None if inverse is None else linear_algebra.cholesky(options.scatter**2 * inverse)
-        if lower is None:
-            continue
-        normal = np.random.default_rng(size).standard_normal((options.scattered, size))
-        shapes = fit.p + normal @ lower.T @ JACOBIANS[kind].T
-        shapes = np.ascontiguousarray(shapes[(shapes[:, 3:] > options.min_size).all(axis=1)])
-        cost = np.empty(len(shapes))
-        numbers = np.full(len(shapes), NUMBERS[kind])
-        negative_log_likelihoods(OUTLINES, numbers, shapes, sensor.data(bundle), options.scatter_blur, cost)
-        made = [replace(fit, p=shapes[k], cost=float(cost[k])) for k in np.argsort(cost, kind="stable").tolist()]
-        own: list[KindFit] = []
-        for one in made[: options.scattered // 4]:
-            if len(own) < options.scatter_kept and not any(_is_same_mode(one, other, replace(options, same_mode=2.0)) for other in (fit, *own)):
-                own.append(one)
-        chosen += own
-    return chosen
+    likely = [fit for fit in best.values() if fit.cost <= lowest + options.scatter_cost_margin]
+    return [start for fit in likely for start in _scattered_about(fit, subset, sensor, options)]
+
+
+def _scattered_about(fit: KindFit, subset: Subset, sensor: BeamModel, options: FitOptions) -> list[Start]:
+    """Return the likeliest of shapes that are scattered about a fit, normally by a wide multiple of its covariance."""
+    jacobian = JACOBIANS[fit.kind]
+    inverse = linear_algebra.inverse(fit.information / sensor.dispersion + np.eye(jacobian.shape[1]))
+    lower = None if inverse is None else linear_algebra.cholesky(options.scatter**2 * inverse)
+    if lower is None:
+        return []
+    shapes = fit.p + _standard_normal(options.scattered, len(lower)) @ (jacobian @ lower).T
+    shapes = np.ascontiguousarray(shapes[(shapes[:, 3:] > options.min_size).all(axis=1)])
+    cost, numbers = np.empty(len(shapes)), np.full(len(shapes), NUMBERS[fit.kind])
+    negative_log_likelihoods(OUTLINES, numbers, shapes, sensor.data(subset.bundle), options.scatter_blur, cost)
+    likeliest = np.argsort(cost, kind="stable")[: options.scatter_kept]
+    return [(fit.kind, shapes[k]) for k in likeliest.tolist()]
+
+
+@lru_cache(maxsize=8)
+def _standard_normal(count: int, size: int) -> FloatArray:
+    """Return standard normal samples (count, size), the same every time, so that results are reproducible."""
+    return np.random.default_rng(size).standard_normal((count, size))
 
 
 def refit_same_kind(
@@ -290,7 +291,8 @@ def distinct_modes(fits: Sequence[KindFit], options: FitOptions = DEFAULTS.fit) 
 
     def cost(fit: KindFit) -> float:
         """Return a fit's cost; one that no prior allows must gain something: where sizes are unseen they drift."""
-        return fit.cost + options.too_large_nats * (fit.p[3:].max() * fit.kind.extent > options.max_extent)
+        is_too_large = bool(fit.p[3:].max() * fit.kind.extent > options.max_extent)
+        return fit.cost + options.too_large_nats * is_too_large
 
     ordered = sorted(fits, key=cost)
     modes = ordered[:1]
