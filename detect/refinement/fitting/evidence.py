@@ -285,9 +285,7 @@ def _moments(points: FloatArray, share: FloatArray) -> tuple[FloatArray, FloatAr
     return mean, (share[:, None] * centred).T @ centred
 
 
-def _posteriors_of(
-    rounds: Sequence[Round], sensor: BeamModel, options: EvidenceOptions
-) -> list[KindPosterior]:
+def _posteriors_of(rounds: Sequence[Round], sensor: BeamModel, options: EvidenceOptions) -> list[KindPosterior]:
     """Return the posteriors of a kind's modes from the samples of all of them.
 
     A sample counts for each mode by the share of that mode's proposal in the density of the mixture there.
