@@ -208,7 +208,7 @@ def _scattered(fits: Sequence[KindFit], subset: Subset, sensor: BeamModel, optio
 
 
 def _scattered_about(fit: KindFit, subset: Subset, sensor: BeamModel, options: FitOptions) -> list[Start]:
-    """Return the likeliest of shapes that are scattered about a fit, normally by a wide multiple of its covariance."""
+    """Return the likeliest of shapes that are scattered about a fit, by a multiple of its covariance."""
     jacobian = JACOBIANS[fit.kind]
     inverse = linear_algebra.inverse(fit.information / sensor.dispersion + np.eye(jacobian.shape[1]))
     lower = None if inverse is None else linear_algebra.cholesky(options.scatter**2 * inverse)

@@ -155,9 +155,9 @@ def test_modes_that_overlap_add_no_evidence() -> None:
     """Without rays the likelihood is 1 everywhere: the evidence of one mode, and of the same in two parts."""
     one = fit(Kind.SQUARE, [0.5, 0.5, 0.3, 0.3, 0.3], std=0.02)
     alone = importance_sample([one], RAYS, SENSOR)
-    twice = importance_sample([one, replace(one, p=one.p + [0.001, 0.0, 0.0, 0.0, 0.0])], RAYS, SENSOR)
+    twice = importance_sample([one, replace(one, p=one.p + np.array([0.001, 0.0, 0.0, 0.0, 0.0]))], RAYS, SENSOR)
     both = np.logaddexp(*(mode.log_evidence for mode in twice))
     assert both == pytest.approx(alone[0].log_evidence, abs=0.5)
-    apart = importance_sample([one, replace(one, p=one.p + [50.0, 0.0, 0.0, 0.0, 0.0])], RAYS, SENSOR)
+    apart = importance_sample([one, replace(one, p=one.p + np.array([50.0, 0.0, 0.0, 0.0, 0.0]))], RAYS, SENSOR)
     total = np.logaddexp(*(mode.log_evidence for mode in apart))
     assert total == pytest.approx(alone[0].log_evidence + math.log(2), abs=0.1)
