@@ -166,7 +166,16 @@ class Anchor:
 
     @classmethod
     def of(cls, fit: KindFit, covariance: FloatArray, options: EvidenceOptions) -> Anchor:
-        """Find it: displacements of the centroid with sizes, by the covariance (5, 5), where these are unseen."""
+        """Find the anchor: how the centroid moves with sizes that are unseen.
+
+        Args:
+            fit: The fit.
+            covariance: (5, 5) of its parameters.
+            options: From which relative standard deviation on a size is unseen.
+
+        Returns:
+            The anchor; the centroid itself where all sizes are seen.
+        """
         shares = np.zeros(2)
         turn = _rotation(np.array([fit.p[2]]))[0]
         for axis, size in enumerate((3, 4)):
@@ -176,7 +185,15 @@ class Anchor:
         return cls(float(fit.p[2]), shares)
 
     def moved(self, points: FloatArray, sign: float) -> FloatArray:
-        """Return points (N, K) with the centroid's place for the anchor's (``sign`` 1), or the reverse (-1)."""
+        """Change between the anchor's place and the centroid's.
+
+        Args:
+            points: (N, K) parameters.
+            sign: 1 from the anchor's to the centroid's, -1 for the reverse.
+
+        Returns:
+            (N, K).
+        """
         if not self.shares.any():
             return points
         sizes = points[:, 3:] if points.shape[1] > 4 else np.repeat(points[:, 3:], 2, axis=1)
@@ -186,7 +203,15 @@ class Anchor:
         return moved
 
     def linear(self, p: FloatArray, size: int) -> FloatArray:
-        """Return the Jacobian (K, K) of the anchor's parameters by the centroid's, at the fit's parameters (5,)."""
+        """Return the Jacobian of the anchor's parameters by the centroid's at the fit.
+
+        Args:
+            p: (5,) the fit's parameters.
+            size: How many own parameters the kind has.
+
+        Returns:
+            (K, K).
+        """
         made = np.eye(size)
         if self.shares.any():
             cos, sin = math.cos(self.theta), math.sin(self.theta)

@@ -11,6 +11,7 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from detect.refinement.fitting.evidence import (
+    Anchor,
     KindPosterior,
     _merged_special_cases,
     compare_kinds,
@@ -161,3 +162,33 @@ def test_modes_that_overlap_add_no_evidence() -> None:
     apart = importance_sample([one, replace(one, p=one.p + np.array([50.0, 0.0, 0.0, 0.0, 0.0]))], RAYS, SENSOR)
     total = np.logaddexp(*(mode.log_evidence for mode in apart))
     assert total == pytest.approx(alone[0].log_evidence + math.log(2), abs=0.1)
+
+
+def test_a_fit_that_the_prior_allows_is_preferred_where_a_size_is_unseen() -> None:
+    """The likelihood is the same however deep it is; a fit that wandered beyond the prior is no other mode."""
+    deep = KindFit(Kind.RECTANGLE, np.array([0.5, 0.5, 0.0, 0.2, 0.9]), 9.9, np.diag([1e6, 0.1, 1e4, 1e6, 0.1]))
+    shallow = replace(deep, p=np.array([0.5, 0.2, 0.0, 0.2, 0.3]), cost=10.0)
+    assert distinct_modes([deep, shallow]) == [shallow]
+    assert distinct_modes([replace(deep, cost=5.0), shallow])[0].cost == 5.0
+
+
+@pytest.mark.parametrize("theta", [0.0, 1.1, -2.5])
+def test_the_anchor_of_an_unseen_depth_is_the_side_that_is_seen(theta: float) -> None:
+    """Shapes that turn about the middle of their front, whatever their depth, differ in angle and depth alone."""
+    depth = np.array([-math.sin(theta), math.cos(theta)])
+    covariance = np.zeros((5, 5))
+    along = np.array([*(0.5 * depth), 0.0, 0.0, 1.0])  # deeper by 1: the centroid is half of that behind the front
+    covariance += 0.04 * np.outer(along, along)
+    one = fit(Kind.RECTANGLE, [*(0.15 * depth), theta, 0.2, 0.3])
+    anchor = Anchor.of(one, covariance, DEFAULTS.evidence)
+    assert anchor.shares == pytest.approx([0.0, 0.5])
+    angles, depths = np.meshgrid(theta + np.linspace(-0.3, 0.3, 5), np.linspace(0.05, 0.6, 5))
+    angles, depths = angles.ravel(), depths.ravel()
+    behind = np.column_stack((-np.sin(angles), np.cos(angles))) * depths[:, None] / 2
+    points = np.column_stack((behind, angles, np.full_like(angles, 0.2), depths))
+    drawn = anchor.moved(points, -1.0)
+    np.testing.assert_allclose(drawn[:, :2], 0.5 * depths[:, None] * depth, atol=1e-12)
+    np.testing.assert_allclose(anchor.moved(drawn, 1.0), points, atol=1e-12)
+    step = 1e-6 * np.eye(5)
+    slopes = (anchor.moved(one.p + step, -1.0) - anchor.moved(one.p - step, -1.0)) / 2e-6
+    np.testing.assert_allclose(slopes.T, anchor.linear(one.p, 5), atol=1e-6)
