@@ -15,7 +15,7 @@ from functools import lru_cache
 
 import numpy as np
 
-from detect.refinement.likelihood.geometry import JACOBIANS, NUMBERS, OUTLINES, parameters_of
+from detect.refinement.likelihood.geometry import JACOBIANS, NUMBERS, OUTLINES, parameters_of, primitive_of
 from detect.refinement.likelihood.kernels import (
     PARAMETERS,
     THETA,
@@ -200,11 +200,17 @@ def refit(
 
 
 def _scattered(fits: Sequence[KindFit], subset: Subset, sensor: BeamModel, options: FitOptions) -> list[Start]:
-    """Return the likeliest of shapes that are scattered about the best fit of each likely kind, as further starts."""
+    """Return further starts about the best fit of each likely kind: scattered shapes, triangles a quarter turn on."""
     lowest = min(fit.cost for fit in fits)
     best = {fit.kind: fit for fit in sorted(fits, key=lambda fit: -fit.cost)}
     likely = [fit for fit in best.values() if fit.cost <= lowest + options.scatter_cost_margin]
-    return [start for fit in likely for start in _scattered_about(fit, subset, sensor, options)]
+    quarter_turns = [
+        (fit.kind, p)
+        for fit in likely
+        if fit.kind.any_apex
+        for p in starts(primitive_of(fit.kind, fit.p), fit.kind, options)[1:4:2]
+    ]
+    return quarter_turns + [start for fit in likely for start in _scattered_about(fit, subset, sensor, options)]
 
 
 def _scattered_about(fit: KindFit, subset: Subset, sensor: BeamModel, options: FitOptions) -> list[Start]:
