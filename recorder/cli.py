@@ -62,6 +62,10 @@ def record(
         str | None,
         typer.Option(metavar="N or A-B", help="How many of each kind: a number or a range. [default: 0-2]"),
     ] = None,
+    clutter: Annotated[
+        str | None,
+        typer.Option(metavar="N or A-B", help="How many things that are none of the kinds. [default: 0]"),
+    ] = None,
     motion: Annotated[
         MotionName, typer.Option(help="The robot is set on a grid of positions, or drives.")
     ] = MotionName.WARP,
@@ -115,7 +119,8 @@ def record(
         size=size,
         walls=walls,
         kinds=kinds,
-        per_kind=_parse_counts(per_kind),
+        per_kind=_parse_counts("--per-kind", per_kind),
+        clutter=_parse_counts("--clutter", clutter),
         motion=motion.value,
         stops=stops,
         duration=duration,
@@ -147,7 +152,7 @@ def _fov_radians(degrees: float) -> float:
     return FOV if degrees == FOV_DEGREES else math.radians(degrees)
 
 
-def _parse_counts(text: str | None) -> tuple[int, int] | None:
+def _parse_counts(option: str, text: str | None) -> tuple[int, int] | None:
     """Parse a number or a range such as 0-2; None stays None. Raises UsageError."""
     if text is None:
         return None
@@ -155,12 +160,15 @@ def _parse_counts(text: str | None) -> tuple[int, int] | None:
     try:
         return int(first), int(last or first)
     except ValueError:
-        raise UsageError(f"--per-kind {text!r} is neither a number nor a range such as 0-2") from None
+        raise UsageError(f"{option} {text!r} is neither a number nor a range such as 0-2") from None
 
 
 def _summary(session: Session, options: SessionOptions) -> str:
     counts = Counter(str(primitive.kind) for primitive in session.world.primitives)
     what = ", ".join(f"{count} {kind}{'s' * (count > 1)}" for kind, count in counts.items()) or "no primitives"
+    if clutter := Counter(solid.name for solid in session.world.clutter):
+        things = ", ".join(name if count == 1 else f"{name} x {count}" for name, count in clutter.items())
+        what += f", {clutter.total()} of clutter ({things})"
     skipped = f" ({session.skipped} stops skipped: something stands there)" if session.skipped else ""
     return (
         f"{session.path}: {session.scans} scans of {options.lidar.rays} rays{skipped}, "

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Collection, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any, TypedDict, Unpack
 
@@ -32,6 +33,7 @@ LARGEST = {
     "speed": 10.0,
     "rays": 1e6,
     "per_kind": 1e4,
+    "clutter": 1e3,
     "stops": 1e5,
     "size": MAX_LENGTH,
     "range_min": MAX_LENGTH,
@@ -62,7 +64,7 @@ class RecordingKeywords(TypedDict, total=False):
     seed: int
     """The same seed and options write the same bytes."""
     world: str | Path | None
-    """A file that describes the world; it excludes size, walls, kinds and per_kind."""
+    """A file that describes the world; it excludes size, walls, kinds, per_kind and clutter."""
     size: tuple[float, float] | None
     """The floor, along x and y."""
     walls: bool | None
@@ -71,6 +73,8 @@ class RecordingKeywords(TypedDict, total=False):
     """The kinds of primitives to draw: a list, or separated by commas; or «all»."""
     per_kind: int | tuple[int, int] | None
     """How many of each kind: a number, or fewest and most."""
+    clutter: int | tuple[int, int] | None
+    """How many things that are none of the kinds: a number, or fewest and most."""
     motion: str
     """«warp»: the robot is set on a grid of positions; «drive»: it drives."""
     stops: tuple[int, int] | None
@@ -148,7 +152,9 @@ def _check_combinations(given: Mapping[str, Any]) -> None:
         raise UsageError(f"--motion {motion}: it is warp or drive")
     drawn = [name for name in _DRAWN if name in given]
     if "world" in given and drawn:
-        raise UsageError("--world excludes --size, --no-walls, --kinds and --per-kind: the file says it all")
+        raise UsageError(
+            "--world excludes --size, --no-walls, --kinds, --per-kind and --clutter: the file says it all"
+        )
     _refuse(given, _WARPED if motion == "drive" else _DRIVEN, motion)
     if "noise" in given and "noise_std" in given:
         raise UsageError("--noise and --noise-std say the same in two units: give one of them")
@@ -208,12 +214,12 @@ def _kinds(listed: Sequence[str] | str) -> tuple[Kind, ...]:
     return tuple(Kind(name) for name in listed)
 
 
-def _per_kind(counts: int | tuple[int, int]) -> tuple[int, int]:
+def _counts(name: str, counts: int | tuple[int, int]) -> tuple[int, int]:
     fewest, most = (counts, counts) if isinstance(counts, int) else counts
     if not 0 <= fewest <= most:
-        raise UsageError(f"--per-kind {fewest}-{most} is not a range from small to large")
-    if most > LARGEST["per_kind"]:
-        raise UsageError(f"--per-kind is {_plain(most)}: it must be from 0 to {LARGEST['per_kind']:g}")
+        raise UsageError(f"{_option(name)} {fewest}-{most} is not a range from small to large")
+    if most > LARGEST[name]:
+        raise UsageError(f"{_option(name)} is {_plain(most)}: it must be from 0 to {LARGEST[name]:g}")
     return fewest, most
 
 
@@ -221,7 +227,7 @@ def _option(name: str) -> str:
     return f"--{name.replace('_', '-')}"
 
 
-_DRAWN = ("size", "walls", "kinds", "per_kind")
+_DRAWN = ("size", "walls", "kinds", "per_kind", "clutter")
 _DRIVEN = ("duration", "speed", "movable", "odom_noise")
 _WARPED = ("stops",)
 _LIDAR = ("rays", "fov", "range_min", "range_max", "noise_std")
@@ -231,7 +237,8 @@ _NOT_NEGATIVE = ("range_min", "noise", "noise_std", "gps_noise", "compass_noise"
 
 _CONVERTED: Mapping[str, Callable[[Any], Any]] = {
     "kinds": _kinds,
-    "per_kind": _per_kind,
+    "per_kind": partial(_counts, "per_kind"),
+    "clutter": partial(_counts, "clutter"),
     "world": Path,
     "gps_noise": Gps,
     "compass_noise": Compass,

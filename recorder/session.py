@@ -129,7 +129,10 @@ class Session:
 
 @dataclass(frozen=True)
 class _Generators:
-    """A random generator for each cause of chance, so that more of one never changes another."""
+    """A random generator for each cause of chance, so that more of one never changes another.
+
+    New ones come last: the others then draw what they always drew.
+    """
 
     world: np.random.Generator
     motion: np.random.Generator
@@ -137,6 +140,7 @@ class _Generators:
     gps: np.random.Generator
     compass: np.random.Generator
     odometry: np.random.Generator
+    clutter: np.random.Generator
 
     @classmethod
     def from_seed(cls, seed: int) -> _Generators:
@@ -171,7 +175,7 @@ def record_session(
         check_no_input([options.world_file], [path])
         world = World.load(options.world_file)
     else:
-        world = draw_world(generators.world, options.world, options.placement)
+        world = draw_world(generators.world, options.world, options.placement, generators.clutter)
     check_output(path, RECORDED_LOG, force)
     steps = _steps(Simulator(world, options.movable, options.simulator), options, generators.motion)
     first = next(steps, None)
@@ -239,6 +243,8 @@ _ONLY_FOR = {"warp": ("stops",), "drive": ("duration", "speed", "movable", "odom
 _UNLESS_DEFAULT = ("simulator", "explorer", "placement")
 """Options that are described only where they are not the defaults."""
 
+_NEWER_WORLD_OPTIONS = ("clutter",)
+"""Options of a drawn world that are described only where they are not the defaults."""
 
 _SIMULATOR_KEYS = {"track_width": "axle"}
 """Metadata keys of the simulator's options where they are not the fields' names."""
@@ -249,6 +255,9 @@ def _describe(options: SessionOptions) -> dict[str, str]:
     described = asdict(options)
     noise = options.odometry
     described["odometry"] = {"metres": noise.translation_std, "radians": noise.rotation_std}
+    for name in _NEWER_WORLD_OPTIONS:
+        if getattr(options.world, name) == getattr(WorldOptions(), name):
+            del described["world"][name]
     described["simulator"] = {_SIMULATOR_KEYS.get(name, name): v for name, v in described["simulator"].items()}
     for name in _ONLY_FOR["warp" if options.motion == "drive" else "drive"]:
         del described[name]

@@ -11,10 +11,11 @@ import math
 from dataclasses import dataclass, replace
 
 import pymunk
+from pymunk.autogeometry import convex_decomposition
 
 from prim.se2 import Pose2D
 from prim.shapes import Primitive
-from prim.world import World
+from prim.world import Solid, World
 
 
 @dataclass(frozen=True)
@@ -64,7 +65,7 @@ class Simulator:
     """A world's bodies and the robot, which is put anywhere by a supervisor or drives by its wheels.
 
     Args:
-        world: The primitives and walls at the start.
+        world: All that stands there at the start; primitives alone can move.
         movable: Whether the robot can push the primitives.
         options: The physics.
     """
@@ -80,6 +81,8 @@ class Simulator:
             wall = pymunk.Segment(self._space.static_body, (x0, y0), (x1, y1), 0.0)
             wall.friction = options.contact_friction
             self._space.add(wall)
+        for solid in world.solids:
+            self._add_solid(solid)
         inertia = pymunk.moment_for_circle(options.robot_mass, 0, options.robot_radius)
         self._robot = pymunk.Body(options.robot_mass, inertia)
         self._disc = pymunk.Circle(self._robot, options.robot_radius)
@@ -159,6 +162,13 @@ class Simulator:
         if movable:
             self._add_floor_friction(body, primitive)
         return body
+
+    def _add_solid(self, solid: Solid) -> None:
+        """Add a thing that never moves, as the convex parts of its outline."""
+        for part in convex_decomposition([*solid.outline, solid.outline[0]], 0.0):
+            shape = pymunk.Poly(self._space.static_body, part)
+            shape.friction = self.options.contact_friction
+            self._space.add(shape)
 
     def _shape(self, primitive: Primitive, body: pymunk.Body) -> pymunk.Shape:
         if not primitive.kind.has_angle:
