@@ -66,6 +66,19 @@ def record(
         str | None,
         typer.Option(metavar="N or A-B", help="How many things that are none of the kinds. [default: 0]"),
     ] = None,
+    room: Annotated[
+        str | None,
+        typer.Option(
+            metavar="NAME,...",
+            help="box, round, corridor or L; doorways, pilasters, furniture; or some of them. [default: box]",
+        ),
+    ] = None,
+    at_walls: Annotated[
+        float | None, typer.Option(metavar="M", help="Every primitive stands this far from a wall; 0: it touches it.")
+    ] = None,
+    touching: Annotated[
+        bool, typer.Option("--touching", help="Primitives stand in pairs that touch each other.")
+    ] = False,
     motion: Annotated[
         MotionName, typer.Option(help="The robot is set on a grid of positions, or drives.")
     ] = MotionName.WARP,
@@ -121,6 +134,9 @@ def record(
         kinds=kinds,
         per_kind=_parse_counts("--per-kind", per_kind),
         clutter=_parse_counts("--clutter", clutter),
+        room=room,
+        at_walls=at_walls,
+        touching=touching,
         motion=motion.value,
         stops=stops,
         duration=duration,

@@ -11,6 +11,7 @@ from typing import Any, TypedDict, Unpack
 from prim.errors import UsageError
 from prim.shapes import Kind
 from recorder.odometry import OdometryNoise
+from recorder.rooms import ELEMENTS, SHAPES
 from recorder.sensors import Compass, Gps, Lidar
 from recorder.session import SessionOptions
 from recorder.world import WorldOptions
@@ -34,6 +35,7 @@ LARGEST = {
     "rays": 1e6,
     "per_kind": 1e4,
     "clutter": 1e3,
+    "at_walls": 1e3,
     "stops": 1e5,
     "size": MAX_LENGTH,
     "range_min": MAX_LENGTH,
@@ -54,6 +56,9 @@ FULL_TURN, ROUNDING = 2 * math.pi, 1e-9
 
 ALL_KINDS = "all"
 
+BOX_ROOM = "box"
+"""The room that is nothing but the walls along the floor's edges."""
+
 
 class RecordingKeywords(TypedDict, total=False):
     """What may be given of a recording; what is not given, or None, is as on the command line.
@@ -64,7 +69,7 @@ class RecordingKeywords(TypedDict, total=False):
     seed: int
     """The same seed and options write the same bytes."""
     world: str | Path | None
-    """A file that describes the world; it excludes size, walls, kinds, per_kind and clutter."""
+    """A file that describes the world; it excludes all that is drawn, from size to touching."""
     size: tuple[float, float] | None
     """The floor, along x and y."""
     walls: bool | None
@@ -75,6 +80,13 @@ class RecordingKeywords(TypedDict, total=False):
     """How many of each kind: a number, or fewest and most."""
     clutter: int | tuple[int, int] | None
     """How many things that are none of the kinds: a number, or fewest and most."""
+    room: Sequence[str] | str | None
+    """What the room is and has: «box», «round», «corridor» or «L»; «doorways», «pilasters», «furniture»; a list, or
+    separated by commas."""
+    at_walls: float | None
+    """How far from a wall every primitive stands; 0: it touches it."""
+    touching: bool
+    """Whether primitives stand in pairs that touch each other; it excludes at_walls."""
     motion: str
     """«warp»: the robot is set on a grid of positions; «drive»: it drives."""
     stops: tuple[int, int] | None
@@ -108,7 +120,7 @@ class RecordingKeywords(TypedDict, total=False):
 PARAMETERS = frozenset(RecordingKeywords.__annotations__)
 """The names of all keywords."""
 
-SWITCHES = frozenset({"walls", "movable"})
+SWITCHES = frozenset({"walls", "movable", "touching"})
 """Those that are true or false."""
 
 
@@ -150,14 +162,24 @@ def _check_combinations(given: Mapping[str, Any]) -> None:
     motion = given.get("motion", SessionOptions.motion)
     if motion not in ("warp", "drive"):
         raise UsageError(f"--motion {motion}: it is warp or drive")
-    drawn = [name for name in _DRAWN if name in given]
+    drawn = [name for name in _DRAWN if name in given and (name != "touching" or given[name])]
     if "world" in given and drawn:
         raise UsageError(
-            "--world excludes --size, --no-walls, --kinds, --per-kind and --clutter: the file says it all"
+            f"--world excludes {'--no-walls' if drawn[0] == 'walls' else _option(drawn[0])}: the file says it all"
         )
+    _check_walls(given)
     _refuse(given, _WARPED if motion == "drive" else _DRIVEN, motion)
     if "noise" in given and "noise_std" in given:
         raise UsageError("--noise and --noise-std say the same in two units: give one of them")
+
+
+def _check_walls(given: Mapping[str, Any]) -> None:
+    """Raise UsageError where a world is to be drawn that cannot be."""
+    if given.get("at_walls") is not None and given.get("touching"):
+        raise UsageError("--at-walls and --touching exclude each other")
+    for name in ("room", "at_walls"):
+        if name in given and given.get("walls") is False:
+            raise UsageError(f"{_option(name)} does not go with --no-walls")
 
 
 def _refuse(given: Mapping[str, Any], names: Collection[str], motion: str) -> None:
@@ -214,6 +236,20 @@ def _kinds(listed: Sequence[str] | str) -> tuple[Kind, ...]:
     return tuple(Kind(name) for name in listed)
 
 
+def _room(listed: Sequence[str] | str) -> tuple[str, ...]:
+    """Return the names of what a room has beside its outer walls, in the order in which it is drawn."""
+    names = [name.strip() for name in (listed.split(",") if isinstance(listed, str) else listed)]
+    known = (BOX_ROOM, *SHAPES, *ELEMENTS)
+    unknown = [name for name in names if name not in known]
+    if unknown or not names:
+        what = f"{', '.join(unknown) or 'nothing'} is nothing of a room"
+        raise UsageError(f"--room {','.join(names)}: {what}; give some of {','.join(known)}")
+    shapes = [name for name in known if name in names and name not in ELEMENTS]
+    if len(shapes) > 1:
+        raise UsageError(f"--room {','.join(names)}: a room is one of {','.join(known[: len(SHAPES) + 1])}")
+    return tuple(name for name in known if name in names and name != BOX_ROOM)
+
+
 def _counts(name: str, counts: int | tuple[int, int]) -> tuple[int, int]:
     fewest, most = (counts, counts) if isinstance(counts, int) else counts
     if not 0 <= fewest <= most:
@@ -227,18 +263,19 @@ def _option(name: str) -> str:
     return f"--{name.replace('_', '-')}"
 
 
-_DRAWN = ("size", "walls", "kinds", "per_kind", "clutter")
+_DRAWN = ("size", "walls", "kinds", "per_kind", "clutter", "room", "at_walls", "touching")
 _DRIVEN = ("duration", "speed", "movable", "odom_noise")
 _WARPED = ("stops",)
 _LIDAR = ("rays", "fov", "range_min", "range_max", "noise_std")
 _DIRECT = ("seed", "motion", "stops", "duration", "speed", "movable", "rate")
 _POSITIVE = ("size", "stops", "duration", "speed", "rate", "rays", "fov", "range_max")
-_NOT_NEGATIVE = ("range_min", "noise", "noise_std", "gps_noise", "compass_noise", "odom_noise", "seed")
+_NOT_NEGATIVE = ("range_min", "noise", "noise_std", "gps_noise", "compass_noise", "odom_noise", "seed", "at_walls")
 
 _CONVERTED: Mapping[str, Callable[[Any], Any]] = {
     "kinds": _kinds,
     "per_kind": partial(_counts, "per_kind"),
     "clutter": partial(_counts, "clutter"),
+    "room": _room,
     "world": Path,
     "gps_noise": Gps,
     "compass_noise": Compass,

@@ -45,9 +45,10 @@ from prim.se2 import Pose2D
 from prim.world import World
 from recorder.motion import ExplorerOptions, Step, drive, warp
 from recorder.odometry import Odometry, OdometryNoise
+from recorder.placement import PlacementOptions
 from recorder.sensors import Compass, Gps, Lidar
 from recorder.simulator import Simulator, SimulatorOptions
-from recorder.world import PlacementOptions, WorldOptions, draw_world
+from recorder.world import OtherGenerators, WorldOptions, draw_world
 
 START = 1_735_689_600_000_000_000
 """The first stamp of every session (ns), 2025-01-01: a session must be the same whenever it is recorded."""
@@ -140,6 +141,7 @@ class _Generators:
     gps: np.random.Generator
     compass: np.random.Generator
     odometry: np.random.Generator
+    room: np.random.Generator
     clutter: np.random.Generator
 
     @classmethod
@@ -175,7 +177,8 @@ def record_session(
         check_no_input([options.world_file], [path])
         world = World.load(options.world_file)
     else:
-        world = draw_world(generators.world, options.world, options.placement, generators.clutter)
+        others = OtherGenerators(generators.room, generators.clutter)
+        world = draw_world(generators.world, options.world, options.placement, others)
     check_output(path, RECORDED_LOG, force)
     steps = _steps(Simulator(world, options.movable, options.simulator), options, generators.motion)
     first = next(steps, None)
@@ -243,7 +246,7 @@ _ONLY_FOR = {"warp": ("stops",), "drive": ("duration", "speed", "movable", "odom
 _UNLESS_DEFAULT = ("simulator", "explorer", "placement")
 """Options that are described only where they are not the defaults."""
 
-_NEWER_WORLD_OPTIONS = ("clutter",)
+_NEWER_WORLD_OPTIONS = ("clutter", "room", "at_walls", "touching")
 """Options of a drawn world that are described only where they are not the defaults."""
 
 _SIMULATOR_KEYS = {"track_width": "axle"}
