@@ -10,6 +10,7 @@ from typing import Any, TypedDict, Unpack
 
 from prim.errors import UsageError
 from prim.shapes import Kind
+from recorder.faults import DROPOUT_VALUES, ScannerFaults
 from recorder.odometry import OdometryNoise
 from recorder.rooms import ELEMENTS, SHAPES
 from recorder.sensors import Compass, Gps, Lidar
@@ -28,6 +29,11 @@ MAX_LENGTH = 1e6
 LARGEST = {
     "noise": 1e3,
     "noise_std": 1e3,
+    "range_bias": 1e3,
+    "quantum": 1e2,
+    "dropout": 1.0,
+    "outliers": 1.0,
+    "noise_growth": 1e2,
     "gps_noise": 1e6,
     "compass_noise": 1e3,
     "odom_noise": 1e3,
@@ -45,6 +51,9 @@ LARGEST = {
 
 SMALLEST = {"size": 1e-2, "speed": 1e-4}
 """The smallest value of options (m, m/s) that else need only be above 0; set by hand."""
+
+MAX_BEAM_WIDTH = math.radians(30)
+"""A beam is no wider (rad); set by hand."""
 
 MAX_SHOWN = 10**300
 """Whole numbers beyond are not written out."""
@@ -111,6 +120,20 @@ class RecordingKeywords(TypedDict, total=False):
     """Standard deviation of the range noise as a share of 5 m, the paper's unit."""
     noise_std: float | None
     """Standard deviation of the range noise (m); it excludes noise."""
+    range_bias: float
+    """What is added to each range."""
+    beam_width: float
+    """Full angular width of a beam (rad); at edges it lights several surfaces."""
+    quantum: float
+    """Ranges are rounded to whole multiples of this."""
+    dropout: float
+    """The share of beams that return nothing."""
+    dropout_as: str | None
+    """What is written for them: «inf», «nan», «0», or «max», the longest range."""
+    outliers: float
+    """The share of beams whose range is uniform between the limits."""
+    noise_growth: float
+    """Standard deviation of a further noise per metre of distance."""
     gps_noise: float
     """Standard deviation of GPS positions (m)."""
     compass_noise: float
@@ -144,12 +167,27 @@ def recording_options(**keywords: Unpack[RecordingKeywords]) -> SessionOptions:
         given["noise_std"] = PAPER_NOISE_UNIT * given["noise"]
     options = SessionOptions(
         world=WorldOptions(**_some({**given, **converted}, _DRAWN)),
-        lidar=Lidar(**_some(given, _LIDAR)),
+        lidar=Lidar(**_some(given, _LIDAR), faults=_faults(given)),
         **_some(given, _DIRECT),
         **{_FIELDS[name]: value for name, value in converted.items() if name in _FIELDS},
     )
     _check_scanner(options)
     return options
+
+
+def _faults(given: Mapping[str, Any]) -> ScannerFaults:
+    """Make the scanner's faults."""
+    written = given.get("dropout_as")
+    if written is not None and written not in DROPOUT_VALUES:
+        raise UsageError(f"--dropout-as {written}: it is one of {', '.join(DROPOUT_VALUES)}")
+    if written is not None and not given.get("dropout"):
+        raise UsageError("--dropout-as says how the beams of --dropout are written: give both")
+    bias = given.get("range_bias", 0.0)
+    if not abs(bias) <= LARGEST["range_bias"]:
+        largest = LARGEST["range_bias"]
+        raise UsageError(f"--range-bias is {bias:g}: it must be from -{largest:g} to {largest:g}")
+    named = {_FAULTS[name]: given[name] for name in _FAULTS if name in given}
+    return ScannerFaults(**named)
 
 
 def _some(given: Mapping[str, Any], names: Collection[str]) -> dict[str, Any]:
@@ -221,6 +259,9 @@ def _check_scanner(options: SessionOptions) -> None:
     if scans / rate > MAX_SECONDS:
         what = "--duration" if options.motion == "drive" else "--stops over --rate"
         raise UsageError(f"{what} gives a session of {scans / rate:g} s: it must not be above {MAX_SECONDS:g} s")
+    if (width := lidar.faults.beam_width) > MAX_BEAM_WIDTH:
+        said = f"{math.degrees(width):g} degrees, {width:g} rad"
+        raise UsageError(f"--beam-width is {said}: it must be from 0 to {math.degrees(MAX_BEAM_WIDTH):g} degrees")
     if lidar.fov > FULL_TURN * (1 + ROUNDING):
         turn = f"{math.degrees(lidar.fov):g} degrees, {lidar.fov:g} rad"
         raise UsageError(f"--fov is more than a full turn: {turn}")
@@ -267,9 +308,28 @@ _DRAWN = ("size", "walls", "kinds", "per_kind", "clutter", "room", "at_walls", "
 _DRIVEN = ("duration", "speed", "movable", "odom_noise")
 _WARPED = ("stops",)
 _LIDAR = ("rays", "fov", "range_min", "range_max", "noise_std")
+_FAULTS = {
+    **{name: name for name in ("range_bias", "beam_width", "quantum", "dropout_as", "outliers", "noise_growth")},
+    "dropout": "dropouts",
+}
+"""The fields of the scanner's faults by the names of their parameters."""
 _DIRECT = ("seed", "motion", "stops", "duration", "speed", "movable", "rate")
 _POSITIVE = ("size", "stops", "duration", "speed", "rate", "rays", "fov", "range_max")
-_NOT_NEGATIVE = ("range_min", "noise", "noise_std", "gps_noise", "compass_noise", "odom_noise", "seed", "at_walls")
+_NOT_NEGATIVE = (
+    "range_min",
+    "noise",
+    "noise_std",
+    "gps_noise",
+    "compass_noise",
+    "odom_noise",
+    "seed",
+    "at_walls",
+    "beam_width",
+    "quantum",
+    "dropout",
+    "outliers",
+    "noise_growth",
+)
 
 _CONVERTED: Mapping[str, Callable[[Any], Any]] = {
     "kinds": _kinds,

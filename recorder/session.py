@@ -43,6 +43,7 @@ from prim.log.messages import (
 from prim.log.writer import RECORDED_LOG, LogWriter
 from prim.se2 import Pose2D
 from prim.world import World
+from recorder.faults import NO_FAULTS, FaultGenerators
 from recorder.motion import ExplorerOptions, Step, drive, warp
 from recorder.odometry import Odometry, OdometryNoise
 from recorder.placement import PlacementOptions
@@ -143,6 +144,9 @@ class _Generators:
     odometry: np.random.Generator
     room: np.random.Generator
     clutter: np.random.Generator
+    beam: np.random.Generator
+    outliers: np.random.Generator
+    dropouts: np.random.Generator
 
     @classmethod
     def from_seed(cls, seed: int) -> _Generators:
@@ -236,7 +240,8 @@ class _StepWriter:
         log.write(ODOM_TOPIC, stamp, encode_odometry(stamp, odometry))
         log.write(TF_TOPIC, stamp, encode_transforms([(stamp, ODOM_FRAME, BASE_FRAME, odometry)]))
         log.write(TRUE_POSE_TOPIC, stamp, encode_pose(stamp, pose))
-        scan = options.lidar.measure(step.world, pose, stamp, 1 / options.rate, generators.lidar)
+        chances = FaultGenerators(generators.beam, generators.outliers, generators.dropouts)
+        scan = options.lidar.measure(step.world, pose, stamp, 1 / options.rate, generators.lidar, chances)
         log.write(SCAN_TOPIC, stamp, encode_scan(scan))
 
 
@@ -261,6 +266,8 @@ def _describe(options: SessionOptions) -> dict[str, str]:
     for name in _NEWER_WORLD_OPTIONS:
         if getattr(options.world, name) == getattr(WorldOptions(), name):
             del described["world"][name]
+    if options.lidar.faults == NO_FAULTS:
+        del described["lidar"]["faults"]
     described["simulator"] = {_SIMULATOR_KEYS.get(name, name): v for name, v in described["simulator"].items()}
     for name in _ONLY_FOR["warp" if options.motion == "drive" else "drive"]:
         del described[name]
