@@ -76,8 +76,9 @@ def put_anywhere(rng: np.random.Generator, outline: FloatArray, size: tuple[floa
 def cover(outline: FloatArray) -> float:
     """Compute how well a primitive covers an outline.
 
-    Of each kind the primitive with the outline's centroid and second moments of area is tried, along either principal
-    axis and either way. The best of all primitives has a somewhat larger IoU.
+    Of each kind the primitive with the outline's centroid and second moments of area is tried, along the principal
+    axes and along the sides of the smallest rectangle about the outline, either way. The best of all primitives has a
+    somewhat larger IoU.
 
     Args:
         outline: Vertices (N, 2) of a simple polygon (m).
@@ -86,24 +87,34 @@ def cover(outline: FloatArray) -> float:
         The largest IoU, from 0 to 1.
     """
     x, y = _centroid(outline)
-    variances, axes = np.linalg.eigh(_covariance(outline))
-    heading = math.atan2(axes[1, 1], axes[0, 1])  # of the larger variance
+    covariance = _covariance(outline)
     polygon = shapely.Polygon(outline)
-    best = 0.0
+    shapes = []
     for kind in Kind:
-        for quarter in range(4 if kind.row.period == TURN else 1):  # of others a quarter turn makes the same
-            along, across = variances[::-1] if quarter % 2 == 0 else variances
-            theta = heading + quarter * TURN / 4 if kind.has_angle else None
-            size = _size(kind, along, across)
-            shape = shapely.Polygon(Primitive(kind, x, y, theta, size).canonical().outline())
-            shared = float(shapely.intersection(polygon, shape, grid_size=OVERLAY_GRID).area)
-            best = max(best, shared / (polygon.area + shape.area - shared))
-    return best
+        for heading in _headings(polygon, covariance, kind):
+            turn = _rotation(heading)
+            size = _size(kind, np.diag(turn @ covariance @ turn.T))
+            theta = heading if kind.has_angle else None
+            shapes.append(shapely.Polygon(Primitive(kind, x, y, theta, size).outline(CURVE_POINTS)))
+    shared = shapely.area(shapely.intersection(shapes, polygon, grid_size=OVERLAY_GRID))
+    return float((shared / (polygon.area + shapely.area(shapes) - shared)).max())
 
 
-def _size(kind: Kind, along: float, across: float) -> tuple[float, ...]:
-    """Return the sizes (m) of a kind whose second moments of area, over the area, are these (m^2)."""
-    width, height = (math.sqrt(f * v) for f, v in zip(kind.spread_factors, (along, across), strict=True))
+def _headings(polygon: shapely.Polygon, covariance: FloatArray, kind: Kind) -> FloatArray:
+    """Return the headings (rad) at which a primitive is tried; a quarter turn changes those of no symmetry."""
+    _, axes = np.linalg.eigh(covariance)
+    corners = shapely.get_coordinates(polygon.minimum_rotated_rectangle)
+    side_x, side_y = corners[1] - corners[0]
+    headings = np.array([math.atan2(axes[1, 1], axes[0, 1]), math.atan2(side_y, side_x)])
+    if not kind.has_angle:
+        return headings[:1]
+    quarters = np.arange(4 if kind.row.period == TURN else 1) * TURN / 4
+    return np.asarray(np.add.outer(headings, quarters).ravel())
+
+
+def _size(kind: Kind, variances: FloatArray) -> tuple[float, ...]:
+    """Return the sizes (m) of a kind whose second moments of area, over the area, are these (2,) (m^2)."""
+    width, height = np.sqrt(np.array(kind.spread_factors) * variances).tolist()
     return (math.sqrt(width * height),) if kind.is_tied else (width, height)
 
 

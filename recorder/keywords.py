@@ -181,7 +181,7 @@ def _faults(given: Mapping[str, Any]) -> ScannerFaults:
     if written is not None and written not in DROPOUT_VALUES:
         raise UsageError(f"--dropout-as {written}: it is one of {', '.join(DROPOUT_VALUES)}")
     if written is not None and not given.get("dropout"):
-        raise UsageError("--dropout-as says how the beams of --dropout are written: give both")
+        raise UsageError("--dropout-as needs --dropout, above 0")
     bias = given.get("range_bias", 0.0)
     if not abs(bias) <= LARGEST["range_bias"]:
         largest = LARGEST["range_bias"]
@@ -284,7 +284,7 @@ def _room(listed: Sequence[str] | str) -> tuple[str, ...]:
     unknown = [name for name in names if name not in known]
     if unknown or not names:
         what = f"{', '.join(unknown) or 'nothing'} is nothing of a room"
-        raise UsageError(f"--room {','.join(names)}: {what}; give some of {','.join(known)}")
+        raise UsageError(f"--room {','.join(names)}: {what}, which is or has {','.join(known)}")
     shapes = [name for name in known if name in names and name not in ELEMENTS]
     if len(shapes) > 1:
         raise UsageError(f"--room {','.join(names)}: a room is one of {','.join(known[: len(SHAPES) + 1])}")

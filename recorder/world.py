@@ -104,11 +104,11 @@ def draw_world(
 def _does_not_fit(options: WorldOptions) -> str:
     width, height = options.size
     clutter = options.clutter[1]
-    others, fewer = (f" and {clutter} of clutter", " or --clutter") if clutter else ("", "")
+    others = f" and {clutter} of clutter" if clutter else ""
     room = " in such a room" if options.room else ""
     return (
         f"{options.per_kind[1]} of each of {len(options.kinds)} kinds{others} do not fit on {width:g} x {height:g} m"
-        f"{room}: give {_larger_floor(options)} or a smaller --per-kind{fewer}"
+        f"{room}: give {_larger_floor(options)} or a smaller --per-kind"
     )
 
 
