@@ -28,6 +28,7 @@ class PlacementOptions:
             of the clutter before another one is drawn.
         things: Things that are drawn for a place in the clutter before the world is drawn anew.
         tries: Places that are tried in all.
+        worlds: Worlds with clutter or a room that are drawn until all finds its place.
         flush: How often a primitive that touches something, or stands at a wall, has a side parallel to it.
         contact_points: Vertices of a round primitive's outline where contacts are computed: 1.4 µm off at 0.3 m.
     """
@@ -36,6 +37,7 @@ class PlacementOptions:
     tries_per_primitive: int = 200
     things: int = 20
     tries: int = 20_000
+    worlds: int = 20
     flush: float = 0.5
     contact_points: int = 1024
 

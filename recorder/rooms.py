@@ -30,7 +30,6 @@ class RoomOptions:
     Attributes:
         round_share: Diameters of a round room, as shares of the floor's sides.
         corridor_share: Width of a corridor, as a share of the floor's shorter side.
-        corridor_width: The same in m; the lesser one counts.
         cut_share: Sides of the block that makes a room an L, as shares of the floor's.
         wall_thickness: Of inner walls that are not thin (m).
         thin_walls: How often inner walls are thin.
@@ -58,8 +57,7 @@ class RoomOptions:
     """
 
     round_share: Range = (0.8, 1.0)
-    corridor_share: Range = (0.4, 0.7)
-    corridor_width: Range = (1.0, 2.5)
+    corridor_share: Range = (0.3, 0.7)
     cut_share: Range = (0.3, 0.6)
     wall_thickness: Range = (0.05, 0.25)
     thin_walls: float = 0.25
@@ -252,7 +250,7 @@ def _corridor(site: _Site) -> None:
     width, height = site.size
     along_x = width > height or (width == height and site.happens(0.5))
     across = min(width, height)
-    strip = min(site.uniform(site.options.corridor_share) * across, site.uniform(site.options.corridor_width))
+    strip = site.uniform(site.options.corridor_share) * across
     middle = site.rng.uniform(-1, 1) * (across - strip) / 2
     x0, y0, x1, y1 = site.floor.bounds
     low, high = middle - strip / 2, middle + strip / 2
@@ -317,6 +315,8 @@ def _pilasters(site: _Site) -> None:
     """Let boxes, wedges and half rounds stick out of the walls, and blocks out of the corners."""
     options = site.options
     for _ in range(site.rng.integers(*options.pilasters, endpoint=True)):
+        if site.free.is_empty:
+            return
         place, direction = site.place_at_wall()
         half = site.uniform(options.pilaster_width, site.widest) / 2
         depth = site.uniform(options.pilaster_depth, site.deepest)

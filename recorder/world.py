@@ -85,7 +85,8 @@ def draw_world(
     """
     others = others or OtherGenerators(*rng.spawn(2))
     tries = iter(range(placement.tries))
-    while True:
+    attempts = placement.worlds if options.room or options.clutter[1] else placement.tries
+    for _ in range(attempts):
         fewest, most = options.per_kind
         kinds = [kind for kind in options.kinds for _ in range(rng.integers(fewest, most, endpoint=True))]
         room = draw_room(others.room, options.size, options.room)
@@ -98,7 +99,8 @@ def draw_world(
             world = world.with_walls() if options.walls else world
             return replace(world, walls=world.walls + room.walls)
         if next(tries, None) is None:
-            raise UsageError(_does_not_fit(options))
+            break
+    raise UsageError(_does_not_fit(options))
 
 
 def _does_not_fit(options: WorldOptions) -> str:
