@@ -10,12 +10,13 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, replace
 
+import numpy as np
 import pymunk
-from pymunk.autogeometry import convex_decomposition
+import shapely
 
 from prim.se2 import Pose2D
 from prim.shapes import Primitive
-from prim.world import Solid, World
+from prim.world import World
 
 
 @dataclass(frozen=True)
@@ -77,12 +78,13 @@ class Simulator:
         self._space.iterations = options.iterations
         self._space.collision_slop, self._space.collision_bias = options.overlap, options.overlap_after_a_second
         self._bodies = [self._add_primitive(primitive, movable) for primitive in world.primitives]
-        for x0, y0, x1, y1 in world.walls:
+        edges = [solid.as_segments() for solid in world.solids]
+        for x0, y0, x1, y1 in np.vstack([np.asarray(world.walls).reshape(-1, 4), *edges]).tolist():
             wall = pymunk.Segment(self._space.static_body, (x0, y0), (x1, y1), 0.0)
             wall.friction = options.contact_friction
             self._space.add(wall)
-        for solid in world.solids:
-            self._add_solid(solid)
+        self._solid = shapely.union_all([shapely.Polygon(solid.outline) for solid in world.solids])
+        shapely.prepare(self._solid)
         inertia = pymunk.moment_for_circle(options.robot_mass, 0, options.robot_radius)
         self._robot = pymunk.Body(options.robot_mass, inertia)
         self._disc = pymunk.Circle(self._robot, options.robot_radius)
@@ -95,7 +97,7 @@ class Simulator:
         self._robot.position, self._robot.angle = (pose.x, pose.y), pose.theta
         self._robot.velocity, self._robot.angular_velocity = (0.0, 0.0), 0.0
         self._disc.cache_bb()
-        return not self._space.shape_query(self._disc)
+        return not self._is_inside(pose.x, pose.y) and not self._space.shape_query(self._disc)
 
     def clearance(self, x: float, y: float, reach: float) -> float:
         """Compute the distance from a point to the nearest thing that cannot move.
@@ -108,8 +110,14 @@ class Simulator:
         Returns:
             The distance (m), negative inside a thing, at most ``reach``.
         """
+        if self._is_inside(x, y):
+            return -float(self._solid.boundary.distance(shapely.Point(x, y)))
         found = self._space.point_query((x, y), reach, pymunk.ShapeFilter())
         return min((hit.distance for hit in found if _is_static(hit.shape)), default=reach)
+
+    def _is_inside(self, x: float, y: float) -> bool:
+        """Return whether a point lies inside clutter or structure, of which the space holds the edges alone."""
+        return bool(shapely.contains_xy(self._solid, x, y))
 
     @property
     def pose(self) -> Pose2D:
@@ -162,13 +170,6 @@ class Simulator:
         if movable:
             self._add_floor_friction(body, primitive)
         return body
-
-    def _add_solid(self, solid: Solid) -> None:
-        """Add a thing that never moves, as the convex parts of its outline."""
-        for part in convex_decomposition([*solid.outline, solid.outline[0]], 0.0):
-            shape = pymunk.Poly(self._space.static_body, part)
-            shape.friction = self.options.contact_friction
-            self._space.add(shape)
 
     def _shape(self, primitive: Primitive, body: pymunk.Body) -> pymunk.Shape:
         if not primitive.kind.has_angle:

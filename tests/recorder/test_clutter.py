@@ -102,7 +102,9 @@ def test_the_robot_stands_on_no_clutter(seed: int) -> None:
         room = min(thing.distance(shapely.Point(x, y)) for thing in solids(world))
         if abs(room - radius) > 1e-6:
             assert simulator.warp(Pose2D(x, y)) == (room > radius)
-        assert simulator.clearance(x, y, 0.04) == pytest.approx(min(room, 0.04), abs=1e-6) or room == 0
+        to_edges = min(thing.exterior.distance(shapely.Point(x, y)) for thing in solids(world))
+        expected = min(room, 0.04) if room else -to_edges
+        assert simulator.clearance(x, y, 0.04) == pytest.approx(expected, abs=1e-6)
 
 
 def test_a_driving_robot_does_not_pass_clutter() -> None:
