@@ -334,7 +334,7 @@ def test_command_line_options_reach_the_log(tmp_path: Path, capsys: pytest.Captu
         (["--room", "attic"], "attic is nothing of a room, which is or has box,"),
         (["--room", "round,L"], "a room is one of box,round,corridor,L"),
         (["--room", "round", "--no-walls"], "--room does not go with --no-walls"),
-        (["--room", "doorways", "--size", "0.1", "0.1"], "finds no place on"),
+        (["--room", "furniture", "--size", "0.1", "0.1"], "finds no place on"),
         (["--at-walls", "0", "--no-walls"], "--at-walls does not go with --no-walls"),
         (["--at-walls", "-1"], "--at-walls is -1"),
         (["--at-walls", "0.1", "--touching"], "exclude each other"),
