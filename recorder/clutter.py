@@ -102,10 +102,10 @@ def cover(outline: FloatArray) -> float:
 
 def _headings(polygon: shapely.Polygon, covariance: FloatArray, kind: Kind) -> FloatArray:
     """Return the headings (rad) at which a primitive is tried; a quarter turn changes those of no symmetry."""
-    _, axes = np.linalg.eigh(covariance)
+    (along_x, mixed), (_, along_y) = covariance
     corners = shapely.get_coordinates(polygon.minimum_rotated_rectangle)
     side_x, side_y = corners[1] - corners[0]
-    headings = np.array([math.atan2(axes[1, 1], axes[0, 1]), math.atan2(side_y, side_x)])
+    headings = np.array([math.atan2(2 * mixed, along_x - along_y) / 2, math.atan2(side_y, side_x)])
     if not kind.has_angle:
         return headings[:1]
     quarters = np.arange(4 if kind.row.period == TURN else 1) * TURN / 4

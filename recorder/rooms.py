@@ -223,7 +223,7 @@ class _Site:
         open_places = self.free.buffer(-options.robot_room).difference(shapely.union_all(thin))
         parts = [part.area for part in shapely.get_parts(open_places)]
         enough = self.free.area >= options.free_share * self.floor.area
-        return enough and bool(parts) and max(parts) >= options.reachable * sum(parts)
+        return enough and max(parts, default=0) > 0 and max(parts) >= options.reachable * sum(parts)
 
 
 def _moved(shape: shapely.Geometry, place: FloatArray, direction: float) -> shapely.Geometry:
