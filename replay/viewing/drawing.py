@@ -41,9 +41,13 @@ UNKNOWN_VALUE = 255
 
 def ring(primitive: Primitive) -> FloatArray:
     """Return a primitive's outline (RING_POINTS + 1, 2) in m, closed by its first point."""
-    outline = primitive.outline(RING_POINTS)
-    closed: FloatArray = np.vstack((outline, outline[:1]))
-    return closed
+    return closed(primitive.outline(RING_POINTS))
+
+
+def closed(outline: FloatArray) -> FloatArray:
+    """Return an outline (N, 2) with its first point again at the end (N + 1, 2)."""
+    points: FloatArray = np.vstack((outline, outline[:1]))
+    return points
 
 
 def uncertainty_bounds(primitive: Primitive, std: Mapping[str, float]) -> Iterator[Primitive]:
