@@ -331,7 +331,7 @@ def _evaluate(
         bool,
         typer.Option(
             "--closed-world",
-            help="Of --suite shipped: take all that stands there to be one of the kinds, or a wall; rows of their own.",
+            help="Of --suite shipped: take all to be one of the kinds, or a wall; in rows of its own.",
         ),
     ] = False,
     jobs: Annotated[

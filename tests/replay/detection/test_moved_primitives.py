@@ -11,7 +11,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from detect.detection import Detection, Detections
+from detect.detection import Detection, Detections, UnknownObject
 from detect.refinement.likelihood.rays import collect_rays
 from detect.refinement.refine import Effort, refine_detections
 from detect.refinement.standing import Verdict, judge_places
@@ -126,6 +126,22 @@ def test_what_was_pushed_within_the_recent_scans_has_error_bars_that_cover_it() 
     (found,) = moved.correct(look, lambda: scans, Effort(max_proposals=0)).found
     assert found.since == 12 and deviations(found, end) < 3
     assert deviations(fit_to(recent, end), end) > 3
+
+
+def test_objects_of_no_kind_stay_but_where_something_has_moved_to() -> None:
+    end = replace(SQUARE, x=SQUARE.x - 0.14)
+    scans = [*scans_of(SQUARE), *later(scans_of(end), 12)]
+    grid, before = map_of(scans), fit_to(scans[:12], SQUARE)
+    far, near = (
+        UnknownObject(np.array([[0.0, 0.0], [0.2, 0.0], [0.0, 0.2]]) + place, 0.004, 0.9, "none", {})
+        for place in ((-0.9, -0.9), (end.x - 0.1, end.y - 0.1))
+    )
+    standing, pushed = scans[:12], scans[12:]
+    for recent, objects in ((standing, (far, near)), (pushed, (far,))):
+        detections = Detections((before,), (), objects=(far, near))
+        look = Look(detections, grid, MapCells.of(grid), NOISE, recent, scans)
+        moved = MovedPrimitives(map_of, lambda _: Detections((), ()), (0.0, 0.0))
+        assert moved.correct(look, lambda: scans, Effort(max_proposals=0)).objects == objects
 
 
 def test_recent_scans_are_those_since_the_last_look_and_enough() -> None:
