@@ -307,8 +307,9 @@ The columns after «refined» evaluate the primitives of a replay, refined with 
 reported primitives (correct kind, polygon IoU of at least 0.5). mAP is the field's (COCO: precision interpolated at
 101 recalls, mean over the kinds): the boxes around the outlines of the reported primitives, each with its kind and
 score. Position (the distance of the centroids), width and height are mean errors over the true positives, the
-angle's error is the median. A primitive that is told to be an object of no kind counts as not found. Rows of a «closed world» (`--closed-world`) do without them: all that stands there is taken to be one of the
-kinds, or a wall. «–»: not measured, or no true positive.
+angle's error is the median. A primitive that is told to be an object of no kind counts as not found. Rows of a
+«closed world» (`--closed-world`) do without such objects: all that stands there is taken to be one of the kinds, or a
+wall. «–»: not measured, or no true positive.
 
 ¹ Weighted mAP is a rule of our own, not to be compared with mAP elsewhere: each primitive counts as every kind with
 that kind's posterior probability, and one that was fitted but rejected counts too, with a tenth of it."""

@@ -50,8 +50,8 @@ def test_outlines_overlap_by_what_they_enclose() -> None:
     corner = np.array([[0.0, 0.0], [3.0, 0.0], [3.0, 1.0], [1.0, 1.0], [1.0, 3.0], [0.0, 3.0]])
     box = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]])
     assert outline_overlap(corner, box) == outline_overlap(box, corner) == pytest.approx(1)
-    assert outline_overlap(corner, box + (1.5, 1.5)) == 0  # within its hull alone
-    assert outline_overlap(corner, box + (0.5, 0.5)) == pytest.approx(0.75)
+    assert outline_overlap(corner, box + 1.5) == 0  # within its hull alone
+    assert outline_overlap(corner, box + 0.5) == pytest.approx(0.75)
     crossing = np.array([[0.0, 0.0], [2.0, 2.0], [2.0, 0.0], [0.0, 2.0]])  # two triangles of area 1
     assert outline_overlap(crossing, box) == pytest.approx(0.5)
     assert outline_overlap(box, np.zeros((3, 2))) == 0

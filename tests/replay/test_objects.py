@@ -44,7 +44,7 @@ from replay.viewing.protocol import NullViewer, ViewerOptions
 from tests.replay.test_viewer import rows_of, timed, value
 
 L_SHAPE = UnknownObject(
-    outline=np.array([[0.0, 0.0], [0.3, 0.0], [0.3, 0.1], [0.1, 0.1], [0.1, 0.25], [0.0, 0.25]]) + (0.4, -0.7),
+    outline=np.add([[0.0, 0.0], [0.3, 0.0], [0.3, 0.1], [0.1, 0.1], [0.1, 0.25], [0.0, 0.25]], (0.4, -0.7)),
     std=0.004,
     score=0.93,
     reason="a free outline explains its rays better by 41 nats",
@@ -82,7 +82,7 @@ class FakeDetector:
 
 @pytest.fixture
 def given_objects(monkeypatch: pytest.MonkeyPatch) -> list[RefinementOptions]:
-    """Let refinement find OBJECTS, and a chance of a tenth for «other» in all else; return the options it is given."""
+    """Let refinement find OBJECTS, and give «other» a chance of a tenth in all else; the options it was given."""
     given: list[RefinementOptions] = []
     real = refine.refine_detections
 
@@ -92,12 +92,11 @@ def given_objects(monkeypatch: pytest.MonkeyPatch) -> list[RefinementOptions]:
         found = tuple(
             replace(
                 detection,
-                score=0.9 * detection.score,
-                kind_probabilities={kind: 0.9 * chance for kind, chance in detection.kind_probabilities.items()},
+                kind_probabilities={kind: 0.9 * chance / sum(chances.values()) for kind, chance in chances.items()},
                 other_probability=0.1,
             )
             for detection in detections.found
-            if detection.kind_probabilities is not None
+            if (chances := detection.kind_probabilities)
         )
         return replace(detections, found=found, objects=OBJECTS), noise_std
 
@@ -183,7 +182,7 @@ def test_chances_sum_to_one_with_other(noisy_session: Session, given_objects: li
     assert given_objects == [RefinementOptions()]
 
 
-def test_without_an_open_world_other_has_no_chance(noisy_session: Session, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_an_open_world_other_has_no_chance(noisy_session: Session) -> None:
     """Whoever reads the chances finds it there all the same."""
     result = prim.replay(noisy_session.path, closed_world=True)
     assert result.primitives and result.objects == ()
@@ -255,7 +254,6 @@ def test_reasons_are_printed_with_verbose(
     detector(monkeypatch, noisy_session, OBJECTS)
     number = len(noisy_session.world.primitives) + 2  # the transient one is found in the first map
     for options, wanted in ((["--verbose"], True), ([], False)):
-        monkeypatch.setattr(FakeDetector, "seen", 0, raising=False)
         command = [str(noisy_session.path), "--no-refine", "--no-viewer", *options]
         detector(monkeypatch, noisy_session, OBJECTS)
         assert console.run(cli.app, "prim-replay", command) == 0

@@ -305,8 +305,8 @@ def test_the_shipped_suite_evaluates_what_is_missing(tmp_path: Path, monkeypatch
     assert counts["driven", 50, "forward"] == counts["driven", 50, "det"] == 5 and counts["warped", 0, "forward"] == 2
     closed = suite.run(5, ["forward"], ["driven"], closed_world=True)
     assert closed[: len(more)] == more  # neither replaces the other's results, of the same sessions
-    assert {(condition.title, value["found"]) for condition, _, _, value in closed[len(more) :]} == {
-        ("driven, closed world", (1, 1, 0.25))
+    assert {(condition.title, value["refined"]["found"][2]) for condition, _, _, value in closed[len(more) :]} == {
+        ("driven, closed world", 0.25)
     }
     with pytest.raises(UsageError, match="nothing has been measured"):
         suites.ShippedSuite(tmp_path / "none", SHIPPED, lambda text: None).results()
