@@ -355,7 +355,7 @@ class RerunViewer:
         return rr.LineStrips3D(
             [self._raised(closed(thing.outline), DETECTION_HEIGHT) for thing in objects],
             colors=[OBJECT_COLOR],
-            radii=rr.Radius.ui_points(2.0),
+            radii=rr.Radius.ui_points(2.5),
         )
 
     def _object_labels(self, objects: Sequence[FoundObject]) -> Any:

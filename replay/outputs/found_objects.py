@@ -15,8 +15,8 @@ from replay.detection.stage import DetectionResult
 if TYPE_CHECKING:
     from detect.detection import UnknownObject
 
-OBJECT_COLOR = (90, 90, 90)
-"""Objects are drawn in this grey, darker than the true primitives."""
+OBJECT_COLOR = (185, 185, 185)
+"""Objects are drawn in this grey: lighter than the true primitives, since their outlines lie on occupied cells."""
 
 
 @dataclass(frozen=True, eq=False)

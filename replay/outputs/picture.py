@@ -33,7 +33,7 @@ PICTURE = ResultFormat("a picture of prim", re.compile(rb"\x89PNG.{33}" + _SOFTW
 LONGER_SIDE = 1000
 """About how many pixels the longer side of a picture has; set by hand."""
 
-GREY = (130, 130, 130)
+GREY, LABEL_GREY = (130, 130, 130), (90, 90, 90)
 FONT = cv2.FONT_HERSHEY_SIMPLEX
 FONT_SCALE, TEXT_THICKNESS, OUTLINE_THICKNESS = 0.5, 1, 2
 SUBPIXEL_BITS = 4
@@ -95,7 +95,7 @@ def draw_picture(
         grid: The map.
         primitives: Drawn in the colours of their kinds, with id and kind.
         truth: Drawn in grey.
-        objects: Those of no kind, drawn in a darker grey, with id.
+        objects: Those of no kind, drawn in a lighter grey, with id.
 
     Returns:
         The picture; the largest y is at the top.
@@ -109,12 +109,14 @@ def draw_picture(
     pixels = cv2.cvtColor(cv2.resize(greys, size, interpolation=interpolation), cv2.COLOR_GRAY2RGB)
     for primitive in truth:
         _draw_outline(pixels, grid.frame, primitive.outline(), GREY)
-    named = [(thing.outline, OBJECT_COLOR, f"{thing.id}: {OTHER}") for thing in objects]
-    named += [(one.primitive.outline(), one.kind.row.color, f"{one.id}: {one.kind}") for one in primitives]
-    for outline, color, _ in named:
-        _draw_outline(pixels, grid.frame, outline, color)
-    for outline, color, text in named:
-        _draw_label(pixels, grid.frame, outline, color, text)
+    for thing in objects:
+        _draw_outline(pixels, grid.frame, thing.outline, OBJECT_COLOR)
+    for found in primitives:
+        _draw_outline(pixels, grid.frame, found.primitive.outline(), found.kind.row.color)
+    for thing in objects:
+        _draw_label(pixels, grid.frame, thing.outline, LABEL_GREY, f"{thing.id}: {OTHER}")
+    for found in primitives:
+        _draw_label(pixels, grid.frame, found.primitive.outline(), found.kind.row.color, f"{found.id}: {found.kind}")
     _draw_scale_bar(pixels, grid.frame)
     return Picture(np.asarray(pixels, np.uint8))
 
