@@ -7,12 +7,15 @@ from collections.abc import Sequence
 from concurrent.futures import Future
 from dataclasses import replace
 from itertools import pairwise
+from types import ModuleType
+from typing import Any
 
 import numpy as np
 import pytest
 
 from detect.detection import Detection, Detections, UnknownObject
 from detect.refinement.likelihood.rays import collect_rays
+from detect.refinement.options import RefinementOptions
 from detect.refinement.refine import Effort, refine_detections
 from detect.refinement.standing import Verdict, judge_places
 from detect.refinement.surroundings.map_cells import MapCells
@@ -26,6 +29,7 @@ from prim.world import World
 from recorder.sensors import Lidar
 from recorder.session import SessionOptions, record_session
 from recorder.world import WorldOptions
+from replay.detection import mixed_places, moved_primitives
 from replay.detection.mixed_places import add_disagreement
 from replay.detection.moved_primitives import Look, MovedPrimitives
 from replay.detection.refiner import RecentScans
@@ -142,6 +146,31 @@ def test_objects_of_no_kind_stay_but_where_something_has_moved_to() -> None:
         look = Look(detections, grid, MapCells.of(grid), NOISE, recent, scans)
         moved = MovedPrimitives(map_of, lambda _: Detections((), ()), (0.0, 0.0))
         assert moved.correct(look, lambda: scans, Effort(max_proposals=0)).objects == objects
+
+
+def test_what_moves_is_refined_and_judged_with_the_options_of_the_replay(monkeypatch: pytest.MonkeyPatch) -> None:
+    given = []
+
+    def watched(module: ModuleType, name: str) -> None:
+        call = getattr(module, name)
+
+        def watch(*arguments: Any) -> Any:
+            given.append((name, [one.closed_world for one in arguments if isinstance(one, RefinementOptions)]))
+            return call(*arguments)
+
+        monkeypatch.setattr(module, name, watch)
+
+    watched(moved_primitives, "refine_detections")
+    watched(moved_primitives, "judge_places")
+    watched(mixed_places, "judge_places")
+    scans = [*scans_of(SQUARE), *later(scans_of(replace(SQUARE, x=SQUARE.x - 0.14)), 12)]
+    grid, before = map_of(scans), fit_to(scans[:12], SQUARE)
+    look = Look(Detections((before,), ()), grid, MapCells.of(grid), NOISE, scans[12:], scans)
+    options = RefinementOptions(closed_world=True)
+    moved = MovedPrimitives(map_of, lambda _: Detections((), ()), (0.0, 0.0), options)
+    assert moved.correct(look, lambda: scans, Effort(max_proposals=0)).found
+    assert {name for name, _ in given} == {"refine_detections", "judge_places"} and len(given) > 4
+    assert all(options == [True] for _, options in given)
 
 
 def test_recent_scans_are_those_since_the_last_look_and_enough() -> None:
