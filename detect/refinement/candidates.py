@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from detect.detection import Detection
 from detect.refinement.fitting.evidence import laplace_evidence, max_size
 from detect.refinement.fitting.fit import SPECIAL_CASES, KindFit, fit_all_kinds, refit, refit_same_kind
-from detect.refinement.likelihood.geometry import JACOBIANS, parameters_of, primitive_of
+from detect.refinement.likelihood.geometry import JACOBIANS, parameters_of, primitive_of, ranges_to
 from detect.refinement.likelihood.rays import RayBundle
 from detect.refinement.likelihood.sensor_model import (
     Background,
@@ -23,6 +23,7 @@ from detect.refinement.likelihood.sensor_model import (
     with_background,
 )
 from detect.refinement.options import DEFAULTS, RefinementOptions
+from detect.refinement.outlines.free_outline import ranges_of
 from detect.refinement.surroundings.map_cells import MapCells
 from detect.refinement.surroundings.walls import Wall, walls_behind
 from prim.arrays import FloatArray
@@ -44,6 +45,7 @@ class Candidate:
         fits: The fits, likeliest kind first.
         fitted_to: The sensor and the rays, with their background, of these fits.
         is_rough: Whether they were made to some of the rays only.
+        outline: Vertices (V, 2) in m of a free outline, where the rays say that no kind fits; else None.
         current: The primitive as far as it is known.
     """
 
@@ -57,6 +59,7 @@ class Candidate:
     fits: list[KindFit] = field(default_factory=list)
     fitted_to: tuple[BeamModel, RayBundle] | None = None
     is_rough: bool = False
+    outline: FloatArray | None = None
     current: Primitive = field(init=False)
     _cached: tuple[Background, float, FloatArray] | None = None
 
@@ -78,19 +81,27 @@ class Candidate:
         if self._cached is None or self._cached[0] is not background or self._cached[1] != sensor.std:
             self._cached = background, sensor.std, background_log_likelihood(self.bundle, background, sensor)
         reach = self.options.map.occluder_distance
-        near = [
-            other.current
-            for other in others
-            if other is not self and centroid_distance(other.start, self.start) < reach
-        ]
-        occluders = [*near, *(wall.stretch for wall in self.walls)]
-        return with_background(self.bundle, background, self._cached[2], occluders, sensor)
+        near = [other for other in others if other is not self and centroid_distance(other.start, self.start) < reach]
+        shapes = [other.current for other in near if other.outline is None]
+        occluders = [*shapes, *(wall.stretch for wall in self.walls)]
+        occlusion = [ranges_of(other.outline, self.bundle) for other in near if other.outline is not None]
+        return with_background(self.bundle, background, self._cached[2], occluders, sensor, occlusion)
 
     def keep_rays(self, chosen: NDArray[np.bool_]) -> None:
         """Leave out all rays but the chosen ones (N,)."""
         self.bundle = self.bundle.select(chosen)
         self.background = self.background and self.background.select(chosen)
         self.fitted_to = self.fitted_to and (self.fitted_to[0], self.fitted_to[1].select(chosen))
+
+    @property
+    def fitted_rays(self) -> RayBundle:
+        """The rays, with their background, that it was fitted to last."""
+        assert self.fitted_to is not None
+        return self.fitted_to[1]
+
+    def surface_ranges(self, bundle: RayBundle) -> FloatArray:
+        """Return the ranges (N,) in m at which rays meet its free outline, else the primitive; FAR for a miss."""
+        return ranges_to(self.current, bundle.rays) if self.outline is None else ranges_of(self.outline, bundle)
 
     @property
     def known_fit(self) -> KindFit:
