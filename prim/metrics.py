@@ -93,9 +93,7 @@ def polygon_iou(a: Primitive, b: Primitive) -> float:
     Returns:
         From 0 to 1.
     """
-    first, second, shared = outline_areas(a.outline(), b.outline())
-    union = first + second - shared
-    return shared / union if union > 0 else 0.0
+    return outline_iou(a.outline(), b.outline())
 
 
 def outline_iou(a: FloatArray, b: FloatArray) -> float:
@@ -108,12 +106,9 @@ def outline_iou(a: FloatArray, b: FloatArray) -> float:
     Returns:
         From 0 to 1; 0 where neither has an area.
     """
-    import shapely
-
-    first, second = (shapely.make_valid(shapely.Polygon(vertices)) for vertices in (a, b))
-    shared = shapely.intersection(first, second, grid_size=OVERLAY_GRID).area
-    union = first.area + second.area - shared
-    return float(shared / union) if union > 0 else 0.0
+    first, second, shared = outline_areas(a, b)
+    union = first + second - shared
+    return shared / union if union > 0 else 0.0
 
 
 def overlap_coefficient(a: Primitive, b: Primitive) -> float:
@@ -150,7 +145,7 @@ def outline_areas(a: FloatArray, b: FloatArray) -> tuple[float, float, float]:
     """Compute the areas of two outlines and of their intersection.
 
     Args:
-        a: Vertices (N, 2) of one in m, convex or not; what an outline that crosses itself encloses counts once.
+        a: Vertices (N, 2) of one in m, convex or not; one that crosses itself counts by the even-odd rule.
         b: Those (M, 2) of the other.
 
     Returns:

@@ -334,10 +334,8 @@ def refine(
     fits = refinement.run([guesses[k] for k in fitted], _checked_pairs(scans))
     found: list[FoundPrimitive | None] = [None] * len(guesses)
     for k, fit in zip(fitted, fits, strict=True):
-        if fit is not None and not rejection_reason(fit):
-            detection = detection_of(fit)
-            if detection.other_probability <= detection.score:
-                found[k] = FoundPrimitive.of(detection, k + 1)
+        if fit is not None and not rejection_reason(fit) and not fit.is_other:
+            found[k] = FoundPrimitive.of(detection_of(fit), k + 1)
     return found
 
 

@@ -20,6 +20,7 @@ from detect.detector import Detector
 from detect.networks.weights import ModelCard
 from detect.refinement import refine
 from detect.refinement.options import RefinementOptions
+from detect.refinement.other import Alternative
 from mapping.grid import OccupancyGrid
 from prim import console
 from prim.errors import UsageError
@@ -349,13 +350,15 @@ def test_a_guess_that_is_likeliest_none_of_the_kinds_is_none(
 ) -> None:
     grid, scans = prim.replay(quiet_session.path, detect=False).grid, list(prim.posed_scans(quiet_session.path))
     guesses = quiet_session.world.primitives[:2]
-    real, given = refine.detection_of, []
+    run, alternative = refine.Refinement.run, Alternative(L_SHAPE.outline, 9.0, 0.004, L_SHAPE.reason)
 
-    def unsure(found: refine.RefinedPrimitive) -> Detection:
-        given.append(found)
-        return replace(real(found), score=0.3, other_probability=0.7 if len(given) == 1 else 0.2)
+    def unsure(*arguments: Any) -> list[refine.RefinedPrimitive | None]:
+        return [
+            found and replace(found, other_probability=other, alternative=alternative)
+            for found, other in zip(run(*arguments), (0.7, 0.2), strict=True)
+        ]
 
-    monkeypatch.setattr(refine, "detection_of", unsure)
+    monkeypatch.setattr(refine.Refinement, "run", unsure)
     first, second = prim.refine(guesses, scans, grid)
     assert first is None and second is not None and second.id == 2
     assert second.chances is not None and second.chances["other"] == 0.2
