@@ -42,11 +42,13 @@ class MovedOptions:
         pose_deviations: The errors of poses are within so many standard deviations …
         pose_distance: … those of headings as they matter at this distance from the laser (m).
         max_shared: Of two detections that share more of the smaller one's area, one is wrong.
+        looks: For so many looks the recent scans are searched for what was found, and by all scans is no more.
     """
 
     pose_deviations: float = 4.0
     pose_distance: float = 2.0
     max_shared: float = 0.25
+    looks: int = 3
 
 
 DEFAULTS = MovedOptions()
@@ -104,6 +106,7 @@ class MovedPrimitives:
         self._refinement = refinement
         self._options = options
         self._moved: tuple[Detection, ...] = ()
+        self._lost: list[tuple[Detection, int]] = []  # and for how many looks
 
     def correct(self, look: Look, scans: Callable[[], Iterable[tuple[Scan, Pose2D]]], effort: Effort) -> Detections:
         """Replace what recent scans contradict by what they show.
@@ -120,7 +123,7 @@ class MovedPrimitives:
         judged = self._judge(found, look.recent, look.cells, look.noise_std)
         stands = [d for d, judgement in zip(found, judged, strict=True) if judgement.verdict is Verdict.STANDS]
         self._moved = tuple(moved for moved in self._moved if not self._stood_always(moved, stands, look))
-        if len(stands) == len(found) and not self._moved:
+        if not (self._has_lost(found) or self._moved) and len(stands) == len(found):
             return look.detections
         pieces = list(scans())
         self._moved = self._refine_moved(look, judged, stands, pieces, effort)
@@ -141,6 +144,15 @@ class MovedPrimitives:
             rejected=tuple(_by_score([*look.detections.rejected, *dropped])),
             objects=tuple(thing for thing in look.detections.objects if not self._is_replaced(thing)),
         )
+
+    def _has_lost(self, found: Sequence[Detection]) -> bool:
+        """Return whether something was found at one of the last looks, and by the rays of all scans is no more.
+
+        A primitive that was pushed is none of the kinds to scans that show it in two places.
+        """
+        lost = [(known, looks + 1) for known, looks in self._lost if not self._shares(known, found)]
+        self._lost = [(known, 0) for known in found] + [pair for pair in lost if pair[1] <= self._options.looks]
+        return len(self._lost) > len(found)
 
     def _is_replaced(self, thing: UnknownObject) -> bool:
         """Return whether an object of no kind, by the rays of all scans, shares too much with what moved."""
