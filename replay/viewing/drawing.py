@@ -8,7 +8,7 @@ from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from mapping.grid import OccupancyGrid
 from prim import linear_algebra
@@ -44,10 +44,10 @@ def ring(primitive: Primitive) -> FloatArray:
     return closed(primitive.outline(RING_POINTS))
 
 
-def closed(outline: FloatArray) -> FloatArray:
-    """Return an outline (N, 2) with its first point again at the end (N + 1, 2)."""
-    points: FloatArray = np.vstack((outline, outline[:1]))
-    return points
+def closed(outline: ArrayLike) -> FloatArray:
+    """Return an outline's vertices (N, 2) and its first one again (N + 1, 2)."""
+    vertices = np.asarray(outline, dtype=float)
+    return np.asarray(np.vstack((vertices, vertices[:1])))
 
 
 def uncertainty_bounds(primitive: Primitive, std: Mapping[str, float]) -> Iterator[Primitive]:
