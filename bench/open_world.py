@@ -265,7 +265,7 @@ def curves(outcomes: Sequence[Outcome]) -> list[str]:
     """
     told = [one for session in outcomes for one in session.told]
     lines = ["", "| score | right | of |", "|---|---:|---:|"]
-    for low, high in zip(SCORES, SCORES[1:], strict=False):
+    for low, high in pairwise(SCORES):
         within = [one.is_right for one in told if low <= one.score < high or (high == 1.0 and one.score == 1.0)]
         lines.append(
             f"| {low:g} to {high:g} | {np.mean(within):.3f} | {len(within)} |"
