@@ -234,6 +234,10 @@ class MapOptions:
     """m; a wall that is free on one side only reaches so far to the other."""
     one_sided: float = 0.2
     """Share of free cells, of the other side's, below which a side is not free."""
+    min_opening: float = 0.1
+    """m; a wall is open where it has no cells over this length at least: noise wears smaller holes into walls."""
+    min_span: float = 0.4
+    """m; between openings a wall is as long at least: a primitive may stand in a doorway."""
     penetration: float = 0.025
     """m; what reaches further behind such a wall is no primitive."""
     touching: float = 0.008
