@@ -13,9 +13,15 @@ that end before they enter it (:func:`likelihood_before`), O that of outliers (:
 (nearer than range_min, REP 117) and no returns are censored measurements: N is replaced by the probability of its
 tail.
 
+Dropouts. Of the rays that end in the grid the share delta returns nothing: black, slanted or shiny surfaces, and
+faults of the scanner. N and its lower tail are multiplied by 1 - delta, and for a no return the upper tail is replaced
+by (1 - delta) Phi((s_k - z_max) / sigma) + delta. E and B say themselves how often nothing returns.
+
 The E step. The responsibilities q_k = (1 - epsilon) T_k o_k N(z; s_k, sigma) / p(z), with those of exit, entry and
 outlier, sum to 1. Cell k receives q_k as an expected hit, and the responsibility of all that lies behind it (exit
 included, outlier not) as an expected pass (Thrun, «Learning occupancy grid maps with forward sensor models», 2003).
+A dropout ended in cell k with probability T_k o_k / sum T o: it adds hits and passes in the odds that the map has
+already, and so neither frees cells nor fills any.
 
 All lengths inside the kernels are in cells. Numba's cache watches only this file: constants that the kernels use must
 stand here, model parameters are arguments. Callers pass the fields of named tuples as plain tuples, which numba
@@ -69,8 +75,11 @@ CENSORED_MOMENTS = 2
 HITS, PASSES, SQUARES_OF_ARRIVAL = 0, 1, 2
 """Columns of an E step's sums per cell."""
 
-LOG_LIKELIHOOD, STOPS, SQUARES, OUTLIERS, RAYS, TRACED_CELLS = range(6)
+LOG_LIKELIHOOD, STOPS, SQUARES, OUTLIERS, RAYS, TRACED_CELLS, DROPOUTS = range(7)
 """Entries of an E step's totals over rays."""
+
+TOTALS = 7
+"""Number of these."""
 
 ROOT_HALF = math.sqrt(0.5)
 PEAK = 1 / math.sqrt(2 * math.pi)
@@ -100,12 +109,14 @@ class SensorModel(NamedTuple):
     Attributes:
         sigma: Standard deviation of the range noise (m; in cells inside the kernels).
         epsilon: Share of outliers.
+        delta: Share of dropouts among the rays that end in the grid.
         rays: The parameters that are not estimated.
         table: The tables made by :func:`noise_tables`.
     """
 
     sigma: float
     epsilon: float
+    delta: float
     rays: RayModel
     table: NDArray[np.float32]
 
@@ -515,6 +526,22 @@ def moments_censored(row: int, count: int, factor: Any, table: Any, scratch: Ray
 
 
 @part
+def add_dropout(count: int, share: Any, flat: Any, scratch: RayScratch) -> None:
+    """Add to a ray's responsibilities those of the cells in which it ended and returned nothing.
+
+    Args:
+        count: The number of cells.
+        share: Responsibility per probability T_k o_k to end in a cell.
+        flat: Stopping probabilities (rows * cols,).
+        scratch: Its ``weight`` is added to.
+    """
+    cells, transmittance, weight = scratch.cells, scratch.transmittance, scratch.weight
+    for i in range(count):
+        n = np.uintp(i)
+        weight[n] += share * transmittance[n] * flat[np.uintp(cells[n])]
+
+
+@part
 def scatter(count: int, behind: Any, scratch: RayScratch, sums: Any, with_arrival: bool) -> None:
     """Add a ray's responsibilities to its cells, from the last one back.
 
@@ -589,20 +616,20 @@ def trace_ray(
 
     Returns:
         MEASURED, TOO_NEAR or NO_RETURN; the number of cells (-1 where the ray misses the grid); the factor of the
-        weights in the density; the likelihoods of what lies behind the cells and of an outlier (with its share); and
-        the density of the measurement.
+        weights in the density; the likelihoods of what lies behind the cells, of a dropout and of an outlier (each
+        with its share); and the density of the measurement.
     """
     rows, cols = stopping.shape
     flat = stopping.reshape(-1)
     x, y, dx, dy, measurement = ray
     z_min, z_max = limits
-    sigma, epsilon, cutoff = sensor.sigma, sensor.epsilon, sensor.rays.transmittance_cutoff
+    sigma, epsilon, delta, cutoff = sensor.sigma, sensor.epsilon, sensor.delta, sensor.rays.transmittance_cutoff
     inverse_sigma = 1 / sigma
     if not (-FAR_CELLS < x < cols + FAR_CELLS and -FAR_CELLS < y < rows + FAR_CELLS):
-        return 0, -1, 0.0, 0.0, 0.0, 1.0
+        return 0, -1, 0.0, 0.0, 0.0, 0.0, 1.0
     first, last, start, major, minor, offset, slope, s0, ds = cells_along_ray(x, y, dx, dy, rows, cols)
     if first > last:
-        return 0, -1, 0.0, 0.0, 0.0, 1.0
+        return 0, -1, 0.0, 0.0, 0.0, 0.0, 1.0
     kind, z, farthest = classify_range(measurement, z_min, z_max, sigma)
     entry = 0.0 if 0 <= x < cols and 0 <= y < rows else s0 + (first - 0.5) * ds
     exit_at = s0 + (last + 0.5) * ds
@@ -618,15 +645,16 @@ def trace_ray(
     elif left >= cutoff and kind == NO_RETURN:
         behind = float(left)
     if kind == MEASURED:
-        scale = PEAK * inverse_sigma
+        scale = PEAK * inverse_sigma * (1 - delta)
         total = weight_measured(count, flat, scratch)
     else:
-        scale = 1.0
+        scale = 1 - delta
         total = weight_censored(kind, count, flat, sensor.table, scratch)
     outlier = epsilon * outlier_likelihood(kind, z_min, z_max, sensor.rays.outlier_tail)
     ahead = likelihood_before(kind, z, z_min, z_max, entry, sensor)
-    density = (1 - epsilon) * (total * scale + behind + ahead) + outlier
-    return kind, count, scale, behind, outlier, density
+    dropout = delta * max(float(enters) - float(left), 0.0) if kind == NO_RETURN else 0.0
+    density = (1 - epsilon) * (total * scale + behind + ahead + dropout) + outlier
+    return kind, count, scale, behind, dropout, outlier, density
 
 
 @inline
@@ -640,8 +668,8 @@ def in_cells(sensor: Fields, resolution: float) -> SensorModel:
     Returns:
         The model, in cells.
     """
-    sigma, epsilon, rays, table = sensor
-    return SensorModel(sigma / resolution, epsilon, RayModel(*rays), table)
+    sigma, epsilon, delta, rays, table = sensor
+    return SensorModel(sigma / resolution, epsilon, delta, RayModel(*rays), table)
 
 
 @inline
@@ -758,7 +786,7 @@ def pose_likelihood(
             y = places[k, 1] + (sin * rays[i, 0] + cos * rays[i, 1]) * per_metre
             dx, dy = cos * rays[i, 2] - sin * rays[i, 3], sin * rays[i, 2] + cos * rays[i, 3]
             ray = (x, y, dx, dy, rays[i, 4] * per_metre)
-            kind, count, _, _, _, density = trace_ray(ray, cells, stopping, 0, model, scratch)
+            kind, count, _, _, _, _, density = trace_ray(ray, cells, stopping, 0, model, scratch)
             if count < 0:
                 kind = classify_range(ray[4], cells[0], cells[1], model.sigma)[0]
                 density = model.epsilon * outlier_likelihood(kind, cells[0], cells[1], model.rays.outlier_tail)
@@ -798,9 +826,9 @@ def expect(
         sensor: Fields of :class:`SensorModel`.
         sums: (rows * cols, 2 or 3) float32, added to: expected HITS and PASSES and, where there is a third column,
             the sum of squares of the rays' probabilities to have reached the cell (SQUARES_OF_ARRIVAL).
-        totals: (6,) float64, added to: LOG_LIKELIHOOD, the expected number of STOPS in the grid, their SQUARES
-            ((z - s)^2 in sigma^2), the expected number of OUTLIERS, RAYS that cross the grid, and their
-            TRACED_CELLS.
+        totals: (7,) float64, added to: LOG_LIKELIHOOD, the expected number of STOPS in the grid but for dropouts,
+            their SQUARES ((z - s)^2 in sigma^2), the expected number of OUTLIERS, RAYS that cross the grid, their
+            TRACED_CELLS, and the expected number of DROPOUTS.
     """
     scans, first_rays, rays = arrays
     subset, grid = RaySlice(*selection), GridGeometry(*geometry)
@@ -817,7 +845,7 @@ def expect(
         limits = (scans[scan, 2] * per_metre, scans[scan, 3] * per_metre)
         ray = (x, y, float(rays[i, 0]), float(rays[i, 1]), float(rays[i, 2]) * per_metre)
         skipped = skip[i] if len(skip) else 0
-        kind, count, scale, behind, outlier, density = trace_ray(ray, limits, stopping, skipped, model, scratch)
+        kind, count, scale, behind, dropout, outlier, density = trace_ray(ray, limits, stopping, skipped, model, scratch)
         if count < 0:
             continue
         weight = (1 - model.epsilon) / density
@@ -826,6 +854,8 @@ def expect(
             stops, squares = moments_measured(count, factor, scratch)
         else:
             stops, squares = moments_censored(CENSORED_MOMENTS + kind, count, factor, model.table, scratch)
+        if dropout > 0:
+            add_dropout(count, np.float32(model.delta * weight), stopping.reshape(-1), scratch)
         scatter(count, np.float32(behind * weight), scratch, sums, with_arrival)
         totals[LOG_LIKELIHOOD] += math.log(density * per_metre if kind == MEASURED else density)
         totals[STOPS] += stops
@@ -833,6 +863,7 @@ def expect(
         totals[OUTLIERS] += outlier / density
         totals[RAYS] += 1
         totals[TRACED_CELLS] += count
+        totals[DROPOUTS] += dropout * weight
 
 
 @kernel
