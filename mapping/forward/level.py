@@ -126,11 +126,11 @@ class SufficientStatistics:
             options: The estimate's bounds.
 
         Returns:
-            ``previous`` with that share; itself where no dropout is expected.
+            ``previous`` with that share; itself where every ray returned.
         """
-        if not self.dropouts:
+        if not previous.dropout_share:
             return previous
-        share = self.dropouts / (self.stops + self.dropouts)
+        share = self.dropouts / max(self.stops + self.dropouts, options.min_stops)
         share = min(max(share, options.min_dropout_share), options.max_dropout_share)
         return previous._replace(dropout_share=share)
 

@@ -15,13 +15,16 @@ tail.
 
 Dropouts. Of the rays that end in the grid the share delta returns nothing: black, slanted or shiny surfaces, and
 faults of the scanner. N and its lower tail are multiplied by 1 - delta, and for a no return the upper tail is replaced
-by (1 - delta) Phi((s_k - z_max) / sigma) + delta. E and B say themselves how often nothing returns.
+by (1 - delta) Phi((s_k - z_max) / sigma) + delta. E and B say themselves how often nothing returns, E of no less than
+delta of the rays. With sum T_k o_k = T_0 - T_exit the density of a no return is
+
+    (1 - epsilon) [(1 - delta) sum_k T_k o_k Phi(.) + T_exit (E - delta) + delta T_0 + B] + epsilon O.
 
 The E step. The responsibilities q_k = (1 - epsilon) T_k o_k N(z; s_k, sigma) / p(z), with those of exit, entry and
 outlier, sum to 1. Cell k receives q_k as an expected hit, and the responsibility of all that lies behind it (exit
 included, outlier not) as an expected pass (Thrun, «Learning occupancy grid maps with forward sensor models», 2003).
-A dropout ended in cell k with probability T_k o_k / sum T o: it adds hits and passes in the odds that the map has
-already, and so neither frees cells nor fills any.
+The part delta T_0 does not depend on the map: a dropout frees nothing and fills nothing. The share delta itself is
+that of dropouts, which have the responsibility delta (T_0 - T_exit), among all rays that end in the grid.
 
 All lengths inside the kernels are in cells. Numba's cache watches only this file: constants that the kernels use must
 stand here, model parameters are arguments. Callers pass the fields of named tuples as plain tuples, which numba
@@ -526,22 +529,6 @@ def moments_censored(row: int, count: int, factor: Any, table: Any, scratch: Ray
 
 
 @part
-def add_dropout(count: int, share: Any, flat: Any, scratch: RayScratch) -> None:
-    """Add to a ray's responsibilities those of the cells in which it ended and returned nothing.
-
-    Args:
-        count: The number of cells.
-        share: Responsibility per probability T_k o_k to end in a cell.
-        flat: Stopping probabilities (rows * cols,).
-        scratch: Its ``weight`` is added to.
-    """
-    cells, transmittance, weight = scratch.cells, scratch.transmittance, scratch.weight
-    for i in range(count):
-        n = np.uintp(i)
-        weight[n] += share * transmittance[n] * flat[np.uintp(cells[n])]
-
-
-@part
 def scatter(count: int, behind: Any, scratch: RayScratch, sums: Any, with_arrival: bool) -> None:
     """Add a ray's responsibilities to its cells, from the last one back.
 
@@ -616,8 +603,8 @@ def trace_ray(
 
     Returns:
         MEASURED, TOO_NEAR or NO_RETURN; the number of cells (-1 where the ray misses the grid); the factor of the
-        weights in the density; the likelihoods of what lies behind the cells, of a dropout and of an outlier (each
-        with its share); and the density of the measurement.
+        weights in the density; the likelihoods of what lies behind the cells, of a dropout in the grid and of an
+        outlier (each with its share); and the density of the measurement.
     """
     rows, cols = stopping.shape
     flat = stopping.reshape(-1)
@@ -639,11 +626,16 @@ def trace_ray(
     x_start, x_step = np.float32((s0 - z) * inverse_sigma), np.float32(ds * inverse_sigma)
     enters = np.float32(1.0 if entry <= 0 else 1 - sensor.rays.hit_before)
     count, left = traverse(line, stop, enters, cutoff, x_start, x_step, flat, scratch)
-    behind = 0.0
+    behind = lost = dropout = 0.0
     if left >= cutoff and leaves:
-        behind = left * likelihood_beyond(kind, z, z_min, z_max, exit_at, sensor)
+        behind = likelihood_beyond(kind, z, z_min, z_max, exit_at, sensor)
     elif left >= cutoff and kind == NO_RETURN:
-        behind = float(left)
+        behind = 1.0
+    if kind == NO_RETURN:
+        behind = max(behind - delta, 0.0)
+        lost = delta * float(enters)
+        dropout = max(lost - delta * float(left), 0.0)
+    behind *= float(left)
     if kind == MEASURED:
         scale = PEAK * inverse_sigma * (1 - delta)
         total = weight_measured(count, flat, scratch)
@@ -652,8 +644,7 @@ def trace_ray(
         total = weight_censored(kind, count, flat, sensor.table, scratch)
     outlier = epsilon * outlier_likelihood(kind, z_min, z_max, sensor.rays.outlier_tail)
     ahead = likelihood_before(kind, z, z_min, z_max, entry, sensor)
-    dropout = delta * max(float(enters) - float(left), 0.0) if kind == NO_RETURN else 0.0
-    density = (1 - epsilon) * (total * scale + behind + ahead + dropout) + outlier
+    density = (1 - epsilon) * (total * scale + behind + ahead + lost) + outlier
     return kind, count, scale, behind, dropout, outlier, density
 
 
@@ -854,8 +845,6 @@ def expect(
             stops, squares = moments_measured(count, factor, scratch)
         else:
             stops, squares = moments_censored(CENSORED_MOMENTS + kind, count, factor, model.table, scratch)
-        if dropout > 0:
-            add_dropout(count, np.float32(model.delta * weight), stopping.reshape(-1), scratch)
         scatter(count, np.float32(behind * weight), scratch, sums, with_arrival)
         totals[LOG_LIKELIHOOD] += math.log(density * per_metre if kind == MEASURED else density)
         totals[STOPS] += stops

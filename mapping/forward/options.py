@@ -51,8 +51,9 @@ class ForwardOptions:
     min_dropout_share: float = 1e-4
     """Lower bound of the share of dropouts, where any ray returned nothing; else it is 0."""
 
-    max_dropout_share: float = 0.5
-    """Upper bound of the share of dropouts."""
+    max_dropout_share: float = 0.3
+    """Upper bound of the share of dropouts: below 1 - ``RayModel.hit_beyond``, so that where nothing at all returns
+    free paths are likelier."""
 
     min_noise_cells: float = 0.15
     """Lower bound of the estimated noise (cells)."""
