@@ -41,6 +41,8 @@ class SensorOptions:
     """Probability that a ray which leaves the map meets nothing at all."""
     censored_doubt: float = 0.1
     """Likelihood of a censored measurement (too near, no return) that nothing explains."""
+    max_dropout_share: float = 0.3
+    """Where a larger share of beams returns nothing, there is nothing."""
     noise_scans: int = 40
     """Scans whose neighbouring beams bound the noise."""
     max_noise_ratio: float = 2.0
