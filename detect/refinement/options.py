@@ -84,7 +84,9 @@ class SensorOptions:
     footprints: tuple[float, ...] = (0.0, 0.0005, 0.001, 0.002, 0.004, 0.008, 0.016)
     """m; footprints that are tried; the first two count as none."""
     same_noise: float = 0.03
-    """Noise that differs by a smaller share does not make fits anew."""
+    """Noise that differs by a smaller share does not make fits anew,"""
+    same_dropouts: float = 0.01
+    """nor do dropouts whose share differs by no more."""
 
 
 @dataclass(frozen=True)

@@ -359,6 +359,7 @@ class Refinement:
         if not single:
             return {}
         noise = known_noise or estimate_noise(single, sensor)
+        dropouts = estimate_dropouts(single, noise, options.sensor)
         sensor = BeamModel.create(noise, span, max_std=max_noise, options=options.sensor, dropout_share=dropouts)
         self._fit_jointly(pool, single, sensor)
         sensor = estimate_sensor(single, sensor, known_noise)
