@@ -41,6 +41,8 @@ class SensorOptions:
     """Probability that a ray which leaves the map meets nothing at all."""
     censored_doubt: float = 0.1
     """Likelihood of a censored measurement (too near, no return) that nothing explains."""
+    min_dropout_share: float = 0.005
+    """A smaller share of dropouts counts as none: ``background_doubt`` times ``censored_doubt`` explains as many."""
     max_dropout_share: float = 0.3
     """Where a larger share of beams returns nothing, there is nothing."""
     noise_scans: int = 40

@@ -67,7 +67,7 @@ def estimate_dropouts(
         options: Margins and bounds.
 
     Returns:
-        The share; 0 where all rays returned.
+        The share; 0 where nearly all rays returned.
     """
     shares, weights = [], []
     if not any((candidate.bundle.outcomes == NO_RETURN).any() for candidate in candidates):
@@ -82,7 +82,8 @@ def estimate_dropouts(
         if share <= options.max_dropout_share:
             shares.append(share)
             weights.append(count)
-    return weighted_median(np.array(shares), np.array(weights))
+    share = weighted_median(np.array(shares), np.array(weights))
+    return share if share >= options.min_dropout_share else 0.0
 
 
 def weighted_median(values: FloatArray, weights: NDArray[np.int64]) -> float:
