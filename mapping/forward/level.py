@@ -99,21 +99,18 @@ class SufficientStatistics:
         """Return whether enough rays stopped to estimate the range noise from them."""
         return self.stops >= options.min_stops
 
-    def range_noise(
-        self, previous: RangeNoise, resolution: float, options: ForwardOptions = DEFAULTS, power: int = 1
-    ) -> RangeNoise:
+    def range_noise(self, previous: RangeNoise, resolution: float, options: ForwardOptions = DEFAULTS) -> RangeNoise:
         """Compute the M step of the range noise.
 
         Args:
             previous: The noise of the E step.
             resolution: Side of a cell (m).
             options: The estimate's bounds.
-            power: See :meth:`with_dropouts`.
 
         Returns:
             The estimate; the standard deviation and the outlier share of ``previous`` where too few rays stopped.
         """
-        previous = self.with_dropouts(previous, options, power)
+        previous = self.with_dropouts(previous, options)
         if not self.determines_noise(options):
             return previous
         std = previous.std * math.sqrt(self.squares / self.stops)
@@ -121,15 +118,12 @@ class SufficientStatistics:
         std = min(max(std, options.min_noise_cells * resolution), options.max_noise)
         return RangeNoise(std, share, previous.dropout_share)
 
-    def with_dropouts(
-        self, previous: RangeNoise, options: ForwardOptions = DEFAULTS, power: int = 1
-    ) -> RangeNoise:
+    def with_dropouts(self, previous: RangeNoise, options: ForwardOptions = DEFAULTS) -> RangeNoise:
         """Compute the M step of the share of dropouts alone.
 
         Args:
             previous: The noise of the E step.
             options: The estimate's bounds.
-            power: Exponent of the odds ratio; above 1 the step is over-relaxed.
 
         Returns:
             ``previous`` with that share; itself where every ray returned.
@@ -137,10 +131,6 @@ class SufficientStatistics:
         if not previous.dropout_share:
             return previous
         share = self.dropouts / max(self.stops + self.dropouts, options.min_stops)
-        if power > 1:
-            before = previous.dropout_share / (1 - previous.dropout_share)
-            odds = before * (share / (1 - share) / before) ** power if share < 1 else math.inf
-            share = odds / (1 + odds) if odds < math.inf else 1.0
         share = min(max(share, options.min_dropout_share), options.max_dropout_share)
         return previous._replace(dropout_share=share)
 

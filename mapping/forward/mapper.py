@@ -342,10 +342,10 @@ class ForwardMapper:
             previous = level.parameters.copy(), sums, statistics, noise
             level.maximize(sums, power if count < passes else 1)
             if estimates_noise:
-                noise = statistics.range_noise(noise, level.frame.resolution, options, power)
+                noise = statistics.range_noise(noise, level.frame.resolution, options)
                 self._is_estimated = statistics.determines_noise(options)
             else:
-                noise = statistics.with_dropouts(noise, options, power)
+                noise = statistics.with_dropouts(noise, options)
         return noise
 
     def _held_out_noise(self, level: Level, noise: RangeNoise) -> RangeNoise:
