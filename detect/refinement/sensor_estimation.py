@@ -272,9 +272,7 @@ def maximum_likelihood_noise(
 
     def cost(log_std: float) -> float:
         std = math.exp(log_std)
-        table = BeamModel.create(
-            std, sensor.span, options=sensor.options, dropout_share=sensor.dropout_share
-        ).table
+        table = BeamModel.create(std, sensor.span, options=sensor.options, dropout_share=sensor.dropout_share).table
         return count * log_std - float(table_nearest(table, outcomes, (ranges - z) / std).sum())
 
     std = math.exp(_minimize(cost, math.log(sensor.std), sensor.options))

@@ -836,7 +836,9 @@ def expect(
         limits = (scans[scan, 2] * per_metre, scans[scan, 3] * per_metre)
         ray = (x, y, float(rays[i, 0]), float(rays[i, 1]), float(rays[i, 2]) * per_metre)
         skipped = skip[i] if len(skip) else 0
-        kind, count, scale, behind, dropout, outlier, density = trace_ray(ray, limits, stopping, skipped, model, scratch)
+        kind, count, scale, behind, dropout, outlier, density = trace_ray(
+            ray, limits, stopping, skipped, model, scratch
+        )
         if count < 0:
             continue
         weight = (1 - model.epsilon) / density

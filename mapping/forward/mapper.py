@@ -463,7 +463,9 @@ class StreamingMap:
         if not found:
             return noise
         if is_noise_fixed:
-            return noise._replace(dropout_share=_mean(noise, _sum_of(found).with_dropouts(noise, options)).dropout_share)
+            return noise._replace(
+                dropout_share=_mean(noise, _sum_of(found).with_dropouts(noise, options)).dropout_share
+            )
         self.determines_noise = any(statistics.determines_noise(options) for statistics in found)
         estimate = _sum_of(found).range_noise(noise, level.frame.resolution, options)
         return _mean(noise, estimate)
