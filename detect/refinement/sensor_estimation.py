@@ -78,12 +78,12 @@ def estimate_dropouts(
         within = ranges_to(candidate.current, bundle.rays) < bundle.max_range - options.max_residual * noise_std
         within &= bundle.passing(candidate.current, -options.footprints[-1]) & ~background.blocked
         count = int(np.count_nonzero(within))
-        share = np.count_nonzero(bundle.outcomes[within] == NO_RETURN) / max(count, 1)
+        share = int(np.count_nonzero(bundle.outcomes[within] == NO_RETURN)) / max(count, 1)
         if share <= options.max_dropout_share:
             shares.append(share)
             weights.append(count)
-    share = weighted_median(np.array(shares), np.array(weights))
-    return share if share >= options.min_dropout_share else 0.0
+    median = weighted_median(np.array(shares), np.array(weights))
+    return median if median >= options.min_dropout_share else 0.0
 
 
 def weighted_median(values: FloatArray, weights: NDArray[np.int64]) -> float:

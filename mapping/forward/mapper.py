@@ -165,7 +165,7 @@ class ForwardMapper:
 
     @property
     def dropout_share(self) -> float:
-        """Share of dropouts among the rays that ended in the map: they returned nothing where others met something."""
+        """Share of dropouts among the rays that ended in the map: of those that returned nothing."""
         return self._noise.dropout_share
 
     def update(self, scan: Scan, pose: Pose2D) -> None:
@@ -477,7 +477,7 @@ def _sum_of(statistics: list[SufficientStatistics]) -> SufficientStatistics:
 
 
 def _mean(old: RangeNoise, new: RangeNoise) -> RangeNoise:
-    """Return the mean of two steps' noise, the geometric one but for dropouts, so that no single scan dominates it."""
+    """Return the mean of two steps' noise, so that no single scan dominates it: geometric but for dropouts."""
     std, outlier_share = math.sqrt(old.std * new.std), math.sqrt(old.outlier_share * new.outlier_share)
     return RangeNoise(std, outlier_share, (old.dropout_share + new.dropout_share) / 2)
 

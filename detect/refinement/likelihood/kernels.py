@@ -176,8 +176,8 @@ def likelihood_table(outlier: float, dropout: float = 0.0) -> FloatArray:
     """Tabulate the log-likelihood of a beam and its derivative over x = (r - z) / sigma, r the range to the surface.
 
     Row MEASURED: log(exp(-x²/2) + outlier), the density in units of its peak. TOO_NEAR: log(Phi(-x) + outlier), z the
-    sensor's range_min. NO_RETURN: log(Phi(x) + outlier), z its range_max. Rows 3 to 5 are their derivatives by x. With
-    dropouts, the exponential and both Phi are multiplied by 1 - dropout, and that is added for a NO_RETURN.
+    sensor's range_min. NO_RETURN: log(Phi(x) + outlier), z its range_max. Rows 3 to 5 are their derivatives by x.
+    With dropouts, the exponential and both Phi are multiplied by 1 - dropout, and dropout is added for a NO_RETURN.
 
     Args:
         outlier: The density of outliers in units of the Gaussian's peak.

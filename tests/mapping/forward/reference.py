@@ -100,13 +100,14 @@ def expect(
             gone -= delta * left
         q = [(1 - epsilon) * part / density for part in parts]
         behind = (1 - epsilon) * gone / density
+        kept = 1 - ((1 - epsilon) * delta * arrived / density if none else 0.0)
         others = (1 - epsilon) * (before + (delta * arrived if none else 0.0)) / density + outlier / density
         sums.worst_sum = max(sums.worst_sum, abs(sum(q) + behind + others - 1))
         for (row, col, _), share in reversed(list(zip(cells, q, strict=False))):
             sums.hits[row, col] += share
             sums.passes[row, col] += behind
             behind += share
-            sums.squares_of_arrival[row, col] += behind**2
+            sums.squares_of_arrival[row, col] += behind**2 / kept
         sums.log_likelihood += math.log(density)
         sums.stops += sum(q)
         sums.squares += sum(share * square for share, square in zip(q, squares, strict=True))
