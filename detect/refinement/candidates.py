@@ -62,7 +62,7 @@ class Candidate:
     is_rough: bool = False
     outline: FloatArray | None = None
     current: Primitive = field(init=False)
-    _cached: tuple[Background, float, FloatArray] | None = None
+    _cached: tuple[Background, tuple[float, float], FloatArray] | None = None
 
     def __post_init__(self) -> None:
         self.current = self.start
@@ -79,8 +79,9 @@ class Candidate:
         """
         background = self.background
         assert background is not None
-        if self._cached is None or self._cached[0] is not background or self._cached[1] != sensor.std:
-            self._cached = background, sensor.std, background_log_likelihood(self.bundle, background, sensor)
+        beams = sensor.std, sensor.dropout_share
+        if self._cached is None or self._cached[0] is not background or self._cached[1] != beams:
+            self._cached = background, beams, background_log_likelihood(self.bundle, background, sensor)
         reach = self.options.map.occluder_distance
         near = [other for other in others if other is not self and centroid_distance(other.start, self.start) < reach]
         shapes = [other.current for other in near if other.outline is None]
@@ -180,6 +181,7 @@ def _is_unchanged(
     """Tell whether fits to earlier rays hold for these."""
     before, fitted_to = earlier
     same_noise = abs(before.std - sensor.std) < options.sensor.same_noise * sensor.std
+    same_noise &= abs(before.dropout_share - sensor.dropout_share) <= options.sensor.same_dropouts
     return same_noise and before.footprint == sensor.footprint and fitted_to.is_similar(bundle, options)
 
 

@@ -24,7 +24,13 @@ def find_misfits(pool: Executor, candidates: Sequence[Candidate], sensor: BeamMo
         sensor: The sensor so far; its footprint and dispersion are not used, since misfits may have spoilt them.
     """
     model = BeamModel.create(
-        sensor.std, sensor.span, candidates[0].options.outline.footprint, 1.0, sensor.max_std, sensor.options
+        sensor.std,
+        sensor.span,
+        candidates[0].options.outline.footprint,
+        1.0,
+        sensor.max_std,
+        sensor.options,
+        sensor.dropout_share,
     )
     bundles = [candidate.rays_with_background(candidates, model) for candidate in candidates]
     work = zip(candidates, bundles, strict=True)
@@ -65,7 +71,8 @@ def sensor_without_misfits(
         find_misfits(pool, candidates, sensor)
         std = noise_std or estimate_noise(candidates, sensor)
         settled = abs(std - sensor.std) < options.same_noise * std
-        sensor = BeamModel.create(std, sensor.span, sensor.footprint, 1.0, sensor.max_std, options)
+        dropouts = sensor.dropout_share
+        sensor = BeamModel.create(std, sensor.span, sensor.footprint, 1.0, sensor.max_std, options, dropouts)
         if settled:
             break
     return sensor

@@ -41,6 +41,10 @@ class SensorOptions:
     """Probability that a ray which leaves the map meets nothing at all."""
     censored_doubt: float = 0.1
     """Likelihood of a censored measurement (too near, no return) that nothing explains."""
+    min_dropout_share: float = 0.005
+    """A smaller share of dropouts counts as none: ``background_doubt`` times ``censored_doubt`` explains as many."""
+    max_dropout_share: float = 0.3
+    """Where a larger share of beams returns nothing, there is nothing."""
     noise_scans: int = 40
     """Scans whose neighbouring beams bound the noise."""
     max_noise_ratio: float = 2.0
@@ -84,7 +88,9 @@ class SensorOptions:
     misfit_rounds: int = 2
     """How often, at most, what fits no kind is sought with the noise that is known by then."""
     same_noise: float = 0.03
-    """Noise that differs by a smaller share does not make fits anew."""
+    """Noise that differs by a smaller share does not make fits anew,"""
+    same_dropouts: float = 0.01
+    """nor do dropouts whose share differs by no more."""
 
 
 @dataclass(frozen=True)

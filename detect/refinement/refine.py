@@ -37,7 +37,7 @@ from detect.refinement.other import (
     other_log_odds,
     simple_outline,
 )
-from detect.refinement.sensor_estimation import estimate_noise, estimate_sensor, initial_noise
+from detect.refinement.sensor_estimation import estimate_dropouts, estimate_noise, estimate_sensor, initial_noise
 from detect.refinement.surroundings.map_cells import MapCells
 from detect.refinement.surroundings.proposals import propose
 from mapping.grid import OccupancyGrid
@@ -414,14 +414,16 @@ class Refinement:
         """Search, remove duplicates, fit jointly, estimate the sensor, and compare kinds; results by id."""
         options, known_noise = self.options, self.noise_std
         noise = known_noise or min(self.guessed_noise or initial_noise(seen, options.sensor), max_noise)
-        sensor = BeamModel.create(noise, span, max_std=max_noise, options=options.sensor)
         find_backgrounds(pool, seen, self.cells, options.map.cleared_first, options)
+        dropouts = estimate_dropouts(seen, noise, options.sensor)
+        sensor = BeamModel.create(noise, span, max_std=max_noise, options=options.sensor, dropout_share=dropouts)
         fit_candidates(pool, seen, [True] * len(seen), sensor)
         single = self._near_rays(without_duplicates(seen, preferred, sensor))
         if not single:
             return {}
         noise = known_noise or estimate_noise(single, sensor)
-        sensor = BeamModel.create(noise, span, max_std=max_noise, options=options.sensor)
+        dropouts = estimate_dropouts(single, noise, options.sensor)
+        sensor = BeamModel.create(noise, span, max_std=max_noise, options=options.sensor, dropout_share=dropouts)
         self._fit_jointly(pool, single, sensor)
         if not options.closed_world:
             sensor = sensor_without_misfits(pool, single, sensor, known_noise)
