@@ -85,6 +85,22 @@ class Rejection:
 
 
 @dataclass(frozen=True)
+class SensorErrors:
+    """Errors that all beams of a scanner have in common, as refinement found and corrected them.
+
+    Attributes:
+        range_bias: Measured less true range (m); 0 where no bias is significant.
+        range_bias_std: Its standard deviation (m); None where there is none.
+        beam_width: The full angle (rad) within which a beam reads the nearest surface, or something between two; 0
+            where neither shows.
+    """
+
+    range_bias: float = 0.0
+    range_bias_std: float | None = None
+    beam_width: float = 0.0
+
+
+@dataclass(frozen=True)
 class Detections:
     """Detections and rejected candidates of one map.
 
@@ -94,9 +110,11 @@ class Detections:
         doubtful: Candidates that were rejected for their score alone, with their rejections (which are in
             ``rejected`` too): refinement decides about them.
         objects: What is likeliest none of the kinds, in descending order of score; refinement alone finds them.
+        sensor: Errors of the scanner that refinement corrected; None where it found none.
     """
 
     found: tuple[Detection, ...]
     rejected: tuple[Rejection, ...]
     doubtful: tuple[tuple[Detection, Rejection], ...] = ()
     objects: tuple[UnknownObject, ...] = ()
+    sensor: SensorErrors | None = None

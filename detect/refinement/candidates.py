@@ -15,6 +15,12 @@ from detect.refinement.fitting.evidence import laplace_evidence, max_size
 from detect.refinement.fitting.fit import SPECIAL_CASES, KindFit, fit_all_kinds, refit, refit_same_kind
 from detect.refinement.likelihood.geometry import JACOBIANS, parameters_of, primitive_of
 from detect.refinement.likelihood.rays import RayBundle
+from detect.refinement.likelihood.scanner_errors import (
+    NO_ERRORS,
+    ScannerErrors,
+    Surroundings,
+    without_errors,
+)
 from detect.refinement.likelihood.sensor_model import (
     Background,
     BeamModel,
@@ -44,6 +50,9 @@ class Candidate:
         fits: The fits, likeliest kind first.
         fitted_to: The sensor and the rays, with their background, of these fits.
         is_rough: Whether they were made to some of the rays only.
+        errors: Errors of the scanner, which are taken out of its rays.
+        shared_errors: (5,) by how much its parameters change with one standard deviation of the scanner's bias; None
+            where it has none.
         current: The primitive as far as it is known.
     """
 
@@ -57,18 +66,28 @@ class Candidate:
     fits: list[KindFit] = field(default_factory=list)
     fitted_to: tuple[BeamModel, RayBundle] | None = None
     is_rough: bool = False
+    errors: ScannerErrors = NO_ERRORS
+    shared_errors: FloatArray | None = None
     current: Primitive = field(init=False)
     _cached: tuple[Background, float, FloatArray] | None = None
 
     def __post_init__(self) -> None:
         self.current = self.start
 
-    def rays_with_background(self, others: Sequence[Candidate], sensor: BeamModel) -> RayBundle:
+    def rays_with_background(
+        self,
+        others: Sequence[Candidate],
+        sensor: BeamModel,
+        errors: ScannerErrors | None = None,
+        shape: Primitive | None = None,
+    ) -> RayBundle:
         """Return its rays with what they measure where they miss it: the map, walls and other candidates.
 
         Args:
             others: All candidates; those far away, and itself, are passed over.
             sensor: The sensor.
+            errors: Errors of the scanner that are taken out; None: those that are known.
+            shape: Where it is thought to be, which these depend on; None: where it was fitted last.
 
         Returns:
             Its rays, the rows OCCLUSION and BACKGROUND set.
@@ -83,7 +102,12 @@ class Candidate:
             for other in others
             if other is not self and centroid_distance(other.start, self.start) < reach
         ]
-        occluders = [*near, *(wall.stretch for wall in self.walls)]
+        walls = [wall.stretch for wall in self.walls]
+        errors = self.errors if errors is None else errors
+        if errors != NO_ERRORS:
+            around = Surroundings(background, self._cached[2], near, walls)
+            return without_errors(self.bundle, around, shape or self.current, sensor, errors)
+        occluders = [*near, *walls]
         return with_background(self.bundle, background, self._cached[2], occluders, sensor)
 
     def keep_rays(self, chosen: NDArray[np.bool_]) -> None:

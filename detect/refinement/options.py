@@ -83,6 +83,50 @@ class SensorOptions:
     """m; footprints that are tried; the first two count as none."""
     same_noise: float = 0.03
     """Noise that differs by a smaller share does not make fits anew."""
+    unexplained: float = -3.0
+    """nats; a background whose log-likelihood is less does not explain a measured range."""
+
+
+@dataclass(frozen=True)
+class ScannerOptions:
+    """Errors that all beams of a scanner have in common, estimated from all candidates together."""
+
+    deviations: float = 5.0
+    """Standard deviations from 0 at which a range bias is told: 1 in 2 million by chance, and models are never exact.
+    """
+    considered: float = 3.0
+    """The same of the bias that the first fits show: with less nothing is fitted anew to find it."""
+    min_bias: float = 0.001
+    """m; a smaller bias is not told."""
+    max_bias: float = 0.05
+    """m; bound of the search: real scanners state 30 mm."""
+    max_step: float = 0.015
+    """m; a step of Gauss and Newton's method is no larger."""
+    steps: int = 5
+    """The most steps; they end where one is below …"""
+    last_step: float = 0.0002
+    """m; … this."""
+    difference: float = 0.25
+    """Range noises; the step of differences by the bias."""
+    agreement: float = 4.0
+    """Standard deviations from the candidates' median, its scatter included, beyond which one has no part."""
+    min_gain: float = 10.0
+    """nats a candidate, and above the dispersion, by which beams of a width must be likelier than without."""
+    reaches: tuple[float, ...] = (0.0015, 0.003, 0.006, 0.012, 0.024)
+    """rad; half-widths of beams that are tried: 0.09 to 1.4 degrees."""
+    refinements: int = 3
+    """Halvings of the interval around the best."""
+    turns: int = 3
+    """Fits in a row, each with rays turned to the nearest surface of the fit before."""
+    footprint: float = 0.001
+    """m; the footprint that beams of a width are tried with: their own width is not in it."""
+    mixed: tuple[float, ...] = (0.004, 0.008, 0.012, 0.016, 0.024)
+    """rad; half-widths within which mixed pixels are counted."""
+    min_mixed_share: float = 0.12
+    """Share of mixed pixels, of the rays between two half-widths, from which on the wider one holds them; 0.01 to
+    0.06 are outliers and errors of the map."""
+    min_mixed: int = 20
+    """Mixed pixels; fewer are outliers."""
 
 
 @dataclass(frozen=True)
@@ -322,6 +366,7 @@ class RefinementOptions:
 
     rays: RayOptions = field(default_factory=RayOptions)
     sensor: SensorOptions = field(default_factory=SensorOptions)
+    scanner: ScannerOptions = field(default_factory=ScannerOptions)
     fit: FitOptions = field(default_factory=FitOptions)
     evidence: EvidenceOptions = field(default_factory=EvidenceOptions)
     map: MapOptions = field(default_factory=MapOptions)

@@ -21,7 +21,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from detect.detection import Detection, Detections, Rejection
+from detect.detection import Detection, Detections, Rejection, SensorErrors
 from detect.refinement.candidates import Candidate, find_backgrounds, fit_candidates
 from detect.refinement.fitting.evidence import compare_kinds
 from detect.refinement.likelihood.geometry import parameters_of, ranges_to
@@ -29,6 +29,7 @@ from detect.refinement.likelihood.kernels import BACKGROUND, OCCLUSION
 from detect.refinement.likelihood.rays import RayBundle, collect_rays
 from detect.refinement.likelihood.sensor_model import Background, BeamModel, DistanceMap, surface_likelihood
 from detect.refinement.options import DEFAULTS, AcceptanceOptions, RefinementOptions
+from detect.refinement.scanner_errors import correct_scanner_errors, with_shared_errors
 from detect.refinement.sensor_estimation import estimate_noise, estimate_sensor, initial_noise
 from detect.refinement.surroundings.map_cells import MapCells
 from detect.refinement.surroundings.proposals import propose
@@ -156,7 +157,7 @@ def refine_detections(
     rejected += [rejection for rejection in detections.rejected if id(rejection) not in judged]
     kept.sort(key=lambda detection: -detection.score)
     rejected.sort(key=lambda rejection: -rejection.score)
-    return Detections(tuple(kept), tuple(rejected)), refinement.noise_std if kept else None
+    return Detections(tuple(kept), tuple(rejected), sensor=refinement.sensor), refinement.noise_std if kept else None
 
 
 def _candidates_of(
@@ -299,6 +300,7 @@ class Refinement:
         guessed_noise: A first guess (m) of the noise, where there is one.
         rounds: Joint fits once duplicates are gone; None: as in the options.
         options: Numeric parameters.
+        sensor: Errors of the scanner that :meth:`run` found and corrected; None where it found none.
     """
 
     cells: MapCells
@@ -307,6 +309,7 @@ class Refinement:
     guessed_noise: float | None = None
     rounds: int | None = None
     options: RefinementOptions = field(default_factory=RefinementOptions)
+    sensor: SensorErrors | None = None
 
     def run(
         self,
@@ -361,6 +364,7 @@ class Refinement:
         sensor = BeamModel.create(noise, span, max_std=max_noise, options=options.sensor)
         self._fit_jointly(pool, single, sensor)
         sensor = estimate_sensor(single, sensor, known_noise)
+        sensor, self.sensor = correct_scanner_errors(pool, single, sensor, known_noise)
         disperses = sensor.dispersion > options.sensor.significant_dispersion
         fit_candidates(pool, single, [disperses] * len(single), sensor)
         self.noise_std = sensor.std
@@ -443,6 +447,8 @@ def finish(candidate: Candidate, map_alone: Background, sensor: BeamModel) -> Re
     posterior = compare_kinds(candidate.fits, bundle, sensor, candidate.is_possible, evidence)
     if posterior is None:
         return None
+    posterior = with_shared_errors(posterior, candidate.shared_errors)
+    map_alone = map_alone.nearer_by(candidate.errors.range_bias)
     ratio = float(-bundle.rays[BACKGROUND].sum() - posterior.cost)
     sectors = candidate.options.acceptance.sectors
     misfit, rays, seen = _compare_with_map(posterior.primitive, bundle, map_alone, sensor, sectors)
