@@ -51,8 +51,8 @@ class Candidate:
         fitted_to: The sensor and the rays, with their background, of these fits.
         is_rough: Whether they were made to some of the rays only.
         errors: Errors of the scanner, which are taken out of its rays.
-        shared_errors: (5,) by how much its parameters change with one standard deviation of the scanner's bias; None
-            where it has none.
+        shared_errors: (5, E) by how much its parameters change with one standard deviation of each error of the
+            scanner; None for none.
         current: The primitive as far as it is known.
     """
 

@@ -83,8 +83,10 @@ class SensorOptions:
     """m; footprints that are tried; the first two count as none."""
     same_noise: float = 0.03
     """Noise that differs by a smaller share does not make fits anew."""
+    beyond: float = 2.45
+    """Range noises; a range that is more beyond a surface is not explained by that,"""
     unexplained: float = -3.0
-    """nats; a background whose log-likelihood is less does not explain a measured range."""
+    """nats; nor by a background whose log-likelihood is less: that is at as many range noises."""
 
 
 @dataclass(frozen=True)
@@ -110,7 +112,7 @@ class ScannerOptions:
     """Range noises; the step of differences by the bias."""
     agreement: float = 4.0
     """Standard deviations from the candidates' median, its scatter included, beyond which one has no part."""
-    min_gain: float = 10.0
+    min_gain: float = 4.0
     """nats a candidate, and above the dispersion, by which beams of a width must be likelier than without."""
     reaches: tuple[float, ...] = (0.0015, 0.003, 0.006, 0.012, 0.024)
     """rad; half-widths of beams that are tried: 0.09 to 1.4 degrees."""
@@ -118,11 +120,14 @@ class ScannerOptions:
     """Halvings of the interval around the best."""
     turns: int = 3
     """Fits in a row, each with rays turned to the nearest surface of the fit before."""
-    footprint: float = 0.001
-    """m; the footprint that beams of a width are tried with: their own width is not in it."""
+    first_footprint: float = 0.001
+    """m; the footprint is no larger where a width is looked for; where one is known, it is 0: jumps show the width best.
+    """
+    reach_tolerance: float = 0.04
+    """Standard deviation of a beam's width, as a share of it: how its parts make one range is known no better."""
     mixed: tuple[float, ...] = (0.004, 0.008, 0.012, 0.016, 0.024)
     """rad; half-widths within which mixed pixels are counted."""
-    min_mixed_share: float = 0.12
+    min_mixed_share: float = 0.15
     """Share of mixed pixels, of the rays between two half-widths, from which on the wider one holds them; 0.01 to
     0.06 are outliers and errors of the map."""
     min_mixed: int = 20

@@ -113,18 +113,39 @@ def correct_scanner_errors(
     for candidate in candidates:
         candidate.errors, candidate.is_rough = errors, True
     sensor = _fit_again(pool, candidates, sensor, noise_std, options)
-    profile = profile_at(pool, candidates, sensor, errors, [candidate.fits[0] for candidate in candidates])
-    std = bias_std(profile, sensor, options) if errors.range_bias else None
-    for candidate, expansion in zip(candidates, profile.candidates, strict=True):
-        candidate.is_rough = True
-        candidate.shared_errors = None if std is None else std * _longer_first(expansion.fit, expansion.slope)
+    std = _add_shared_errors(pool, candidates, sensor, errors, options)
     return sensor, SensorErrors(errors.range_bias, std, 2 * max(errors.reach, errors.mixed))
 
 
-def _longer_first(fit: KindFit, slope: FloatArray) -> FloatArray:
-    """Return derivatives (5,) of a fit's parameters in the order of sizes that its kind is reported with."""
+def _add_shared_errors(
+    pool: Executor,
+    candidates: Sequence[Candidate],
+    sensor: BeamModel,
+    errors: ScannerErrors,
+    options: ScannerOptions,
+) -> float | None:
+    """Set what is unsure about candidates because the scanner's errors are; return the bias's std (m), if any."""
+    profile = profile_at(pool, candidates, sensor, errors, [candidate.fits[0] for candidate in candidates])
+    std = bias_std(profile, sensor, options) if errors.range_bias else None
+    changes = [[] if std is None else [std * one.slope] for one in profile.candidates]
+    if errors.reach:
+        unsure = options.reach_tolerance * errors.reach
+        sides = [
+            profile_at(pool, candidates, sensor, replace(errors, reach=errors.reach + sign * unsure), profile.fits)
+            for sign in (-1, 1)
+        ]
+        for change, before, after in zip(changes, *(side.fits for side in sides), strict=True):
+            change.append(0.5 * (after.p - before.p))
+    for candidate, fit, change in zip(candidates, profile.fits, changes, strict=True):
+        candidate.is_rough = True
+        candidate.shared_errors = _longer_first(fit, np.array(change).T) if change else None
+    return std
+
+
+def _longer_first(fit: KindFit, changes: FloatArray) -> FloatArray:
+    """Return changes (5, E) of a fit's parameters in the order of sizes that its kind is reported with."""
     swapped = fit.kind.longer_first and fit.p[3] < fit.p[4]
-    return slope[[0, 1, 2, 4, 3]] if swapped else slope
+    return changes[[0, 1, 2, 4, 3]] if swapped else changes
 
 
 def with_shared_errors(posterior: Posterior, shared: FloatArray | None) -> Posterior:
@@ -132,7 +153,7 @@ def with_shared_errors(posterior: Posterior, shared: FloatArray | None) -> Poste
 
     Args:
         posterior: The posterior, given these errors.
-        shared: (5,) by how much the parameters change with one standard deviation of the bias; None for no bias.
+        shared: (5, E) by how much the parameters change with one standard deviation of each error; None for none.
 
     Returns:
         The posterior.
@@ -140,8 +161,8 @@ def with_shared_errors(posterior: Posterior, shared: FloatArray | None) -> Poste
     if shared is None:
         return posterior
     jacobian = JACOBIANS[posterior.primitive.kind]
-    change = shared @ (jacobian / (jacobian**2).sum(axis=0))
-    covariance = posterior.covariance + np.outer(change, change)
+    own = (jacobian / (jacobian**2).sum(axis=0)).T @ shared
+    covariance = posterior.covariance + own @ own.T
     std = dict(zip(posterior.std, np.sqrt(np.diag(covariance)).tolist(), strict=True))
     return replace(posterior, covariance=covariance, std=std)
 
@@ -178,7 +199,8 @@ def _likeliest(
     fits = [candidate.fits[0] for candidate in candidates]
     biased = with_best_bias(pool, candidates, sensor, replace(known, reach=0.0), fits)
     if is_wide:
-        wide = _with_best_reach(pool, candidates, sensor, biased, options)
+        blurred = replace(sensor, footprint=0.0 if known.reach else min(sensor.footprint, options.first_footprint))
+        wide = _with_best_reach(pool, candidates, blurred, biased, options)
         if biased.cost - wide.cost > options.min_gain * len(candidates) * sensor.dispersion:
             biased = wide
     errors = biased.errors
@@ -202,11 +224,10 @@ def _with_best_reach(
     options: ScannerOptions,
 ) -> Profile:
     """Return the likeliest profile with beams of a width: the best of some, then of those halfway to its neighbours."""
-    narrow = replace(sensor, footprint=min(sensor.footprint, options.footprint))
     found: dict[float, Profile] = {}
 
     def at(reach: float, near: Profile) -> Profile:
-        found[reach] = with_best_bias(pool, candidates, narrow, replace(near.errors, reach=reach), near.fits)
+        found[reach] = with_best_bias(pool, candidates, sensor, replace(near.errors, reach=reach), near.fits)
         return found[reach]
 
     near = start
@@ -374,8 +395,8 @@ def mixed_pixels(
         options: The half-widths and the thresholds.
 
     Returns:
-        The largest one (rad) that has so many of them, of the rays that hold a silhouette in it and not in the
-        one before; 0 where none has.
+        The largest one (rad) up to which many of the rays that hold a silhouette in a half-width, and not in the one
+        before, are mixed; 0 where the smallest has few.
     """
     held, between = np.zeros(len(options.mixed)), np.zeros(len(options.mixed))
     for candidate in candidates:
@@ -386,4 +407,5 @@ def mixed_pixels(
             counts += [np.count_nonzero(mask) for mask in masks]
     rings, mixed = np.diff(held, prepend=0.0), np.diff(between, prepend=0.0)
     many = (mixed >= options.min_mixed) & (mixed > options.min_mixed_share * rings)
-    return float(options.mixed[int(np.flatnonzero(many)[-1])]) if many.any() else 0.0
+    count = int(np.logical_and.accumulate(many).sum())
+    return float(options.mixed[count - 1]) if count else 0.0

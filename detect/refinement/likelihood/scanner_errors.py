@@ -175,7 +175,7 @@ def silhouette_readings(
         near = np.minimum.reduce(sides)
         held = (near < FAR) & (np.maximum(sides[0], sides[2]) == FAR) & (near < rays[OCCLUSION])
         held &= bundle.outcomes == MEASURED
-        beyond = rays[RANGE] > near + limits.max_residual * sensor.std
+        beyond = rays[RANGE] > near + limits.beyond * sensor.std
         holds.append(held)
         between.append(held & beyond & (rays[BACKGROUND] < limits.unexplained))
     return holds, between
