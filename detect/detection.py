@@ -91,13 +91,15 @@ class SensorErrors:
     Attributes:
         range_bias: Measured less true range (m); 0 where no bias is significant.
         range_bias_std: Its standard deviation (m); None where there is none.
-        beam_width: The full angle (rad) within which a beam reads the nearest surface, or something between two; 0
-            where neither shows.
+        nearest_within: The full angle (rad) of a beam within which it reads the nearest surface; 0 where its width
+            does not show.
+        mixed_within: The same, within which two surfaces may give a range between both.
     """
 
     range_bias: float = 0.0
     range_bias_std: float | None = None
-    beam_width: float = 0.0
+    nearest_within: float = 0.0
+    mixed_within: float = 0.0
 
 
 @dataclass(frozen=True)

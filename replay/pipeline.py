@@ -17,6 +17,7 @@ from replay.ground_truth import GroundTruth
 from replay.localization import Localization, localize, pose_scans
 from replay.mapping.bounds import choose_map_bounds
 from replay.mapping.memory import MemoryBudget
+from replay.notes import sensor_notes
 from replay.mapping.stage import blames_log_for_size
 from replay.options import ReplayOptions
 from replay.replay_evaluator import ReplayEvaluator
@@ -236,7 +237,11 @@ class Pipeline:
                 rays=branch.usage.rays,
                 lost=tuple(log.lost),
                 interrupted=self._interrupted,
-                notes=(*notes, *branch.notes(outcome.grid)),
+                notes=(
+                    *notes,
+                    *branch.notes(outcome.grid),
+                    *sensor_notes(outcome.detections and outcome.detections.detections.sensor),
+                ),
                 messages_lost=log.messages_lost,
                 poses=posed_scans.poses,
                 stamps=scans.stamps,

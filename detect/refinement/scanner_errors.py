@@ -114,7 +114,21 @@ def correct_scanner_errors(
         candidate.errors, candidate.is_rough = errors, True
     sensor = _fit_again(pool, candidates, sensor, noise_std, options)
     std = _add_shared_errors(pool, candidates, sensor, errors, options)
-    return sensor, SensorErrors(errors.range_bias, std, 2 * max(errors.reach, errors.mixed))
+    return sensor, SensorErrors(errors.range_bias, std, 2 * errors.reach, 2 * errors.mixed)
+
+
+def errors_of(found: SensorErrors | None) -> ScannerErrors:
+    """Return errors that were found as they are taken out of rays.
+
+    Args:
+        found: The errors; None for none.
+
+    Returns:
+        The errors.
+    """
+    if found is None:
+        return NO_ERRORS
+    return ScannerErrors(found.range_bias, 0.5 * found.nearest_within, 0.5 * found.mixed_within)
 
 
 def _add_shared_errors(
@@ -129,7 +143,7 @@ def _add_shared_errors(
     std = bias_std(profile, sensor, options) if errors.range_bias else None
     changes = [[] if std is None else [std * one.slope] for one in profile.candidates]
     if errors.reach:
-        unsure = options.reach_tolerance * errors.reach
+        unsure = math.hypot(options.reach_std, options.relative_reach_std * errors.reach)
         sides = [
             profile_at(pool, candidates, sensor, replace(errors, reach=errors.reach + sign * unsure), profile.fits)
             for sign in (-1, 1)
@@ -346,7 +360,9 @@ def with_best_bias(
     return profile
 
 
-def common_step(profile: Profile, sensor: BeamModel, options: ScannerOptions = DEFAULTS.scanner) -> tuple[float, float]:
+def common_step(
+    profile: Profile, sensor: BeamModel, options: ScannerOptions = DEFAULTS.scanner
+) -> tuple[float, float]:
     """Combine what candidates would add to the bias.
 
     Args:
