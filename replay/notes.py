@@ -23,14 +23,7 @@ def pluralize(count: int, noun: str) -> str:
 
 
 def sensor_notes(errors: SensorErrors | None) -> list[str]:
-    """Describe the errors of a scanner that refinement corrected.
-
-    Args:
-        errors: The errors; None for none.
-
-    Returns:
-        The notes.
-    """
+    """Describe the errors of the scanner that refinement corrected; empty where there are none."""
     if errors is None:
         return []
     notes = []

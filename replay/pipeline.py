@@ -17,8 +17,8 @@ from replay.ground_truth import GroundTruth
 from replay.localization import Localization, localize, pose_scans
 from replay.mapping.bounds import choose_map_bounds
 from replay.mapping.memory import MemoryBudget
-from replay.notes import sensor_notes
 from replay.mapping.stage import blames_log_for_size
+from replay.notes import sensor_notes
 from replay.options import ReplayOptions
 from replay.replay_evaluator import ReplayEvaluator
 from replay.result import ReplayResult, distinct_notes
@@ -240,7 +240,7 @@ class Pipeline:
                 notes=(
                     *notes,
                     *branch.notes(outcome.grid),
-                    *sensor_notes(outcome.detections and outcome.detections.detections.sensor),
+                    *sensor_notes(outcome.detections),
                 ),
                 messages_lost=log.messages_lost,
                 poses=posed_scans.poses,

@@ -121,8 +121,7 @@ class ScannerOptions:
     turns: int = 3
     """Fits in a row, each with rays turned to the nearest surface of the fit before."""
     first_footprint: float = 0.001
-    """m; the footprint is no larger where a width is looked for; where one is known, it is 0: jumps show the width best.
-    """
+    """m; the footprint is no larger where a width is looked for. Where one is known it is 0: jumps show it best."""
     reach_std: float = 0.0003
     """rad; standard deviation of a half-width: how the parts of a beam make one range is known no better …"""
     relative_reach_std: float = 0.03

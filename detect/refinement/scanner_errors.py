@@ -1,10 +1,11 @@
 """Errors that all beams of a scanner have in common, estimated from all candidates together: range bias, beam width.
 
-Both make shapes wrong and look sure: silhouettes say one size, ranges another. One candidate alone cannot tell much of
-a bias, since its size and place give way; all together do. The likelihood is profiled: at each value of an error every
-candidate is fitted anew, by its likeliest kind. The bias is found by Gauss and Newton's method, with the candidates'
-own parameters eliminated by Schur complements; the beam's width by a search, since the likelihood jumps at
-silhouettes. An error counts where it gains enough, and where the candidates agree on it.
+Both make sizes wrong, and error bars too small: silhouettes say one size, ranges another. A candidate alone tells
+little of a bias, since its place and size give way; together they do. The likelihood is profiled: at each value of an
+error all candidates are fitted anew, each by its likeliest kind. The bias is found by Gauss and Newton's method, with
+the candidates' own parameters eliminated by Schur complements; the beams' width by a search, since the likelihood
+jumps at silhouettes. A bias counts where it is significant by the candidates' own scatter, a width where it gains
+enough.
 """
 
 from __future__ import annotations
@@ -13,6 +14,7 @@ import math
 from collections.abc import Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, replace
+from itertools import repeat
 
 import numpy as np
 
@@ -58,34 +60,33 @@ class BiasExpansion:
 
 @dataclass(frozen=True)
 class Profile:
-    """The fits of all candidates, given some errors of the scanner.
+    """The fits of candidates, given some errors of the scanner.
 
     Attributes:
         errors: The errors.
-        candidates: The likelihood of each.
+        expansions: The likelihood of each candidate.
     """
 
     errors: ScannerErrors
-    candidates: Sequence[BiasExpansion]
+    expansions: Sequence[BiasExpansion]
 
     @property
     def fits(self) -> list[KindFit]:
         """The fits."""
-        return [candidate.fit for candidate in self.candidates]
+        return [one.fit for one in self.expansions]
 
     @property
     def cost(self) -> float:
         """The negative log-likelihood of all (nats)."""
-        return sum(candidate.cost for candidate in self.candidates)
-
-    def steps(self) -> tuple[FloatArray, FloatArray]:
-        """Return what each candidate that knows of the bias would add to it (m), and what it knows (nats / m²)."""
-        knowing = [candidate for candidate in self.candidates if candidate.curvature > 0]
-        return np.array([one.step for one in knowing]), np.array([one.curvature for one in knowing])
+        return sum(one.cost for one in self.expansions)
 
 
 def correct_scanner_errors(
-    pool: Executor, candidates: Sequence[Candidate], sensor: BeamModel, noise_std: float | None
+    pool: Executor,
+    candidates: Sequence[Candidate],
+    sensor: BeamModel,
+    noise_std: float | None,
+    trusted: Sequence[Candidate] | None = None,
 ) -> tuple[BeamModel, SensorErrors | None]:
     """Find the errors that all beams have in common, take them out of the candidates' rays, and fit anew.
 
@@ -94,27 +95,194 @@ def correct_scanner_errors(
         candidates: The fitted candidates; where errors are found, they are fitted anew, all kinds of them.
         sensor: The sensor, estimated as if there were none.
         noise_std: The range noise (m) where it is known.
+        trusted: Those of the candidates that fit their rays, by which errors are found; None: all of them.
 
     Returns:
         The sensor, estimated anew where errors were found, and these; None for none.
     """
-    if not candidates:
+    trusted = candidates if trusted is None else trusted
+    if not trusted:
         return sensor, None
-    options = candidates[0].options.scanner
-    errors = ScannerErrors(mixed=mixed_pixels(candidates, sensor, options))
-    errors = _likeliest(pool, candidates, sensor, errors, options)
+    search = ErrorSearch(pool, candidates, trusted, trusted[0].options.scanner)
+    errors = search.likeliest(sensor, ScannerErrors(mixed=mixed_pixels(trusted, candidates, sensor, search.options)))
     if errors == NO_ERRORS:
         return sensor, None
     for candidate in candidates:
-        candidate.errors, candidate.fitted_to = errors, None
-    sensor = _fit_again(pool, candidates, sensor, noise_std, options)
+        candidate.errors, candidate.fitted_to = errors, None  # so that all kinds are searched
+    sensor = search.fit_again(sensor, noise_std)
     if errors.range_bias or errors.reach:
-        errors = _likeliest(pool, candidates, sensor, errors, options)
+        errors = search.likeliest(sensor, errors)
     for candidate in candidates:
-        candidate.errors, candidate.is_rough = errors, True
-    sensor = _fit_again(pool, candidates, sensor, noise_std, options)
-    std = _add_shared_errors(pool, candidates, sensor, errors, options)
+        candidate.errors = errors
+    sensor = search.fit_again(sensor, noise_std)
+    std = search.add_shared_errors(sensor, errors)
     return sensor, SensorErrors(errors.range_bias, std, 2 * errors.reach, 2 * errors.mixed)
+
+
+@dataclass(frozen=True)
+class ErrorSearch:
+    """Finds a scanner's errors by the likelihood of candidates.
+
+    Attributes:
+        pool: The threads.
+        candidates: All candidates: they occlude each other.
+        trusted: Those that are asked.
+        options: Numeric parameters.
+    """
+
+    pool: Executor
+    candidates: Sequence[Candidate]
+    trusted: Sequence[Candidate]
+    options: ScannerOptions = DEFAULTS.scanner
+
+    def likeliest(self, sensor: BeamModel, known: ScannerErrors) -> ScannerErrors:
+        """Find the errors that count: a bias that is significant, and a width that gains enough.
+
+        Args:
+            sensor: The sensor.
+            known: Mixed pixels, and what was found before.
+
+        Returns:
+            The errors.
+        """
+        options = self.options
+        is_wide = known.reach or sensor.footprint > 0 or sensor.dispersion > sensor.options.significant_dispersion
+        fits = [candidate.fits[0] for candidate in self.trusted]
+        if known == NO_ERRORS and not is_wide:
+            step, std = common_step(self.as_fitted(sensor), sensor, options)
+            if abs(step) < options.considered * std:
+                return known
+        likeliest = self.with_best_bias(sensor, replace(known, reach=0.0), fits)
+        if is_wide:
+            footprint = 0.0 if known.reach else min(sensor.footprint, options.first_footprint)
+            wide = self._with_best_reach(replace(sensor, footprint=footprint), likeliest)
+            if likeliest.cost - wide.cost > options.min_gain * len(self.trusted) * sensor.dispersion:
+                likeliest = wide
+        errors = likeliest.errors
+        std = common_step(likeliest, sensor, options)[1]
+        is_biased = abs(errors.range_bias) >= max(options.min_bias, options.deviations * std)
+        return errors if is_biased else replace(errors, range_bias=0.0)
+
+    def as_fitted(self, sensor: BeamModel) -> Profile:
+        """Return the candidates' likelihoods around the fits that they have, without errors of the scanner."""
+        expansions = []
+        for candidate in self.trusted:
+            bundle, fit = candidate.rays_with_background(self.candidates, sensor), candidate.fits[0]
+            expansions.append(expand_in_bias(fit, fit.cost, bundle, sensor, self.options))
+        return Profile(NO_ERRORS, expansions)
+
+    def at(self, sensor: BeamModel, errors: ScannerErrors, fits: Sequence[KindFit]) -> Profile:
+        """Fit the trusted candidates, each by one kind, given some errors of the scanner; they stay as they are.
+
+        Args:
+            sensor: The sensor.
+            errors: The errors.
+            fits: What the fits begin with.
+
+        Returns:
+            The profile.
+        """
+        return Profile(errors, list(self.pool.map(self._fit, self.trusted, fits, repeat(sensor), repeat(errors))))
+
+    def _fit(self, candidate: Candidate, fit: KindFit, sensor: BeamModel, errors: ScannerErrors) -> BiasExpansion:
+        """Fit one candidate; turned rays follow its last fit."""
+        options = candidate.options
+        for _ in range(self.options.turns if errors.reach else 1):
+            shape = primitive_of(fit.kind, fit.p)
+            bundle = candidate.rays_with_background(self.candidates, sensor, errors, shape)
+            (fit,) = refit_same_kind(fit, bundle, sensor, options.fit)
+        if errors.reach:
+            shape = primitive_of(fit.kind, fit.p)
+            bundle = candidate.rays_with_background(self.candidates, sensor, errors, shape)
+        cost = float(exact_costs(fit.kind, fit.p[None], bundle, sensor, options.evidence)[0])
+        return expand_in_bias(fit, cost if math.isfinite(cost) else fit.cost, bundle, sensor, self.options)
+
+    def with_best_bias(self, sensor: BeamModel, errors: ScannerErrors, fits: Sequence[KindFit]) -> Profile:
+        """Find the likeliest range bias by Gauss and Newton's method.
+
+        Args:
+            sensor: The sensor.
+            errors: The errors to begin with.
+            fits: The fits to begin with.
+
+        Returns:
+            The profile there.
+        """
+        options = self.options
+        profile = self.at(sensor, errors, fits)
+        for _ in range(options.steps):
+            step = min(max(common_step(profile, sensor, options)[0], -options.max_step), options.max_step)
+            bias = min(max(profile.errors.range_bias + step, -options.max_bias), options.max_bias)
+            if abs(bias - profile.errors.range_bias) < options.last_step:
+                break
+            profile = self.at(sensor, replace(profile.errors, range_bias=bias), profile.fits)
+        return profile
+
+    def _with_best_reach(self, sensor: BeamModel, start: Profile) -> Profile:
+        """Return the likeliest profile with beams of a width: the best of some, then halfway to its neighbours."""
+        found: dict[float, Profile] = {}
+
+        def add(reach: float, near: Profile) -> Profile:
+            found[reach] = self.with_best_bias(sensor, replace(near.errors, reach=reach), near.fits)
+            return found[reach]
+
+        near = start
+        for reach in self.options.reaches:
+            near = add(reach, near)
+        for _ in range(self.options.refinements):
+            known = sorted(found)
+            best = min(known, key=lambda reach: found[reach].cost)
+            place = known.index(best)
+            for other in (*known[max(place - 1, 0) : place], *known[place + 1 : place + 2]):
+                add(0.5 * (best + other), found[best])
+        return min(found.values(), key=lambda profile: profile.cost)
+
+    def fit_again(self, sensor: BeamModel, noise_std: float | None) -> BeamModel:
+        """Fit all candidates without the scanner's errors, and estimate the sensor anew.
+
+        Args:
+            sensor: The sensor so far.
+            noise_std: The range noise (m) where it is known.
+
+        Returns:
+            The sensor.
+        """
+        for _ in range(self.options.turns if self.candidates[0].errors.reach else 1):
+            for candidate in self.candidates:
+                candidate.is_rough = True  # so that it is fitted again though its background is the same
+            fit_candidates(self.pool, self.candidates, [False] * len(self.candidates), sensor)
+        return estimate_sensor(self.trusted, sensor, noise_std)
+
+    def add_shared_errors(self, sensor: BeamModel, errors: ScannerErrors) -> float | None:
+        """Set what is unsure about all candidates because the scanner's errors are.
+
+        Args:
+            sensor: The sensor.
+            errors: The errors that were taken out.
+
+        Returns:
+            The bias's standard deviation (m); None without a bias.
+        """
+        options = self.options
+        std = None
+        if errors.range_bias:
+            fits = [candidate.fits[0] for candidate in self.trusted]
+            std = common_step(self.at(sensor, errors, fits), sensor, options)[1]
+        everyone = replace(self, trusted=self.candidates)
+        profile = everyone.at(sensor, errors, [candidate.fits[0] for candidate in self.candidates])
+        changes = [[] if std is None else [std * one.slope] for one in profile.expansions]
+        if errors.reach:
+            unsure = math.hypot(options.reach_std, options.relative_reach_std * errors.reach)
+            less, more = (
+                everyone.at(sensor, replace(errors, reach=errors.reach + sign * unsure), profile.fits).fits
+                for sign in (-1, 1)
+            )
+            for change, before, after in zip(changes, less, more, strict=True):
+                change.append(0.5 * (after.p - before.p))
+        for candidate, fit, change in zip(self.candidates, profile.fits, changes, strict=True):
+            candidate.is_rough = True  # fitted once more, with the sensor as it was estimated last
+            candidate.shared_errors = _longer_first(fit, np.array(change).T) if change else None
+        return std
 
 
 def errors_of(found: SensorErrors | None) -> ScannerErrors:
@@ -129,31 +297,6 @@ def errors_of(found: SensorErrors | None) -> ScannerErrors:
     if found is None:
         return NO_ERRORS
     return ScannerErrors(found.range_bias, 0.5 * found.nearest_within, 0.5 * found.mixed_within)
-
-
-def _add_shared_errors(
-    pool: Executor,
-    candidates: Sequence[Candidate],
-    sensor: BeamModel,
-    errors: ScannerErrors,
-    options: ScannerOptions,
-) -> float | None:
-    """Set what is unsure about candidates because the scanner's errors are; return the bias's std (m), if any."""
-    profile = profile_at(pool, candidates, sensor, errors, [candidate.fits[0] for candidate in candidates])
-    std = bias_std(profile, sensor, options) if errors.range_bias else None
-    changes = [[] if std is None else [std * one.slope] for one in profile.candidates]
-    if errors.reach:
-        unsure = math.hypot(options.reach_std, options.relative_reach_std * errors.reach)
-        sides = [
-            profile_at(pool, candidates, sensor, replace(errors, reach=errors.reach + sign * unsure), profile.fits)
-            for sign in (-1, 1)
-        ]
-        for change, before, after in zip(changes, *(side.fits for side in sides), strict=True):
-            change.append(0.5 * (after.p - before.p))
-    for candidate, fit, change in zip(candidates, profile.fits, changes, strict=True):
-        candidate.is_rough = True
-        candidate.shared_errors = _longer_first(fit, np.array(change).T) if change else None
-    return std
 
 
 def _longer_first(fit: KindFit, changes: FloatArray) -> FloatArray:
@@ -179,116 +322,6 @@ def with_shared_errors(posterior: Posterior, shared: FloatArray | None) -> Poste
     covariance = posterior.covariance + own @ own.T
     std = dict(zip(posterior.std, np.sqrt(np.diag(covariance)).tolist(), strict=True))
     return replace(posterior, covariance=covariance, std=std)
-
-
-def _fit_again(
-    pool: Executor,
-    candidates: Sequence[Candidate],
-    sensor: BeamModel,
-    noise_std: float | None,
-    options: ScannerOptions,
-) -> BeamModel:
-    """Fit all candidates with the scanner's errors taken out, and estimate the sensor anew."""
-    turns = options.turns if candidates[0].errors.reach else 1
-    for _ in range(turns):
-        fit_candidates(pool, candidates, [False] * len(candidates), sensor)
-        for candidate in candidates:
-            candidate.is_rough = True
-    return estimate_sensor(candidates, sensor, noise_std)
-
-
-def _likeliest(
-    pool: Executor,
-    candidates: Sequence[Candidate],
-    sensor: BeamModel,
-    known: ScannerErrors,
-    options: ScannerOptions,
-) -> ScannerErrors:
-    """Return the errors that count: known mixed pixels, and a bias and a width that gain enough."""
-    is_wide = known.reach or sensor.footprint > 0 or sensor.dispersion > sensor.options.significant_dispersion
-    if known == NO_ERRORS and not is_wide:
-        step, std = common_step(_as_fitted(candidates, sensor), sensor, options)
-        if abs(step) < options.considered * std:
-            return known
-    fits = [candidate.fits[0] for candidate in candidates]
-    biased = with_best_bias(pool, candidates, sensor, replace(known, reach=0.0), fits)
-    if is_wide:
-        blurred = replace(sensor, footprint=0.0 if known.reach else min(sensor.footprint, options.first_footprint))
-        wide = _with_best_reach(pool, candidates, blurred, biased, options)
-        if biased.cost - wide.cost > options.min_gain * len(candidates) * sensor.dispersion:
-            biased = wide
-    errors = biased.errors
-    return errors if is_biased(biased, sensor, options) else replace(errors, range_bias=0.0)
-
-
-def _as_fitted(candidates: Sequence[Candidate], sensor: BeamModel) -> Profile:
-    """Return the candidates' likelihoods around the fits that they have."""
-    expansions = []
-    for candidate in candidates:
-        bundle, fit = candidate.rays_with_background(candidates, sensor), candidate.fits[0]
-        expansions.append(expand_in_bias(fit, fit.cost, bundle, sensor, candidate.options.scanner))
-    return Profile(NO_ERRORS, expansions)
-
-
-def _with_best_reach(
-    pool: Executor,
-    candidates: Sequence[Candidate],
-    sensor: BeamModel,
-    start: Profile,
-    options: ScannerOptions,
-) -> Profile:
-    """Return the likeliest profile with beams of a width: the best of some, then of those halfway to its neighbours."""
-    found: dict[float, Profile] = {}
-
-    def at(reach: float, near: Profile) -> Profile:
-        found[reach] = with_best_bias(pool, candidates, sensor, replace(near.errors, reach=reach), near.fits)
-        return found[reach]
-
-    near = start
-    for reach in options.reaches:
-        near = at(reach, near)
-    for _ in range(options.refinements):
-        known = sorted(found)
-        best = min(known, key=lambda reach: found[reach].cost)
-        around = [other for k, other in enumerate(known) if abs(k - known.index(best)) == 1]
-        for other in around:
-            at(0.5 * (best + other), found[best])
-    return min(found.values(), key=lambda profile: profile.cost)
-
-
-def profile_at(
-    pool: Executor,
-    candidates: Sequence[Candidate],
-    sensor: BeamModel,
-    errors: ScannerErrors,
-    fits: Sequence[KindFit],
-) -> Profile:
-    """Fit all candidates, each by one kind, given some errors of the scanner.
-
-    Args:
-        pool: The threads.
-        candidates: The candidates, which stay as they are.
-        sensor: The sensor.
-        errors: The errors.
-        fits: What the fits begin with.
-
-    Returns:
-        The profile.
-    """
-
-    def expand(pair: tuple[Candidate, KindFit]) -> BiasExpansion:
-        candidate, fit = pair
-        options = candidate.options
-        for _ in range(options.scanner.turns if errors.reach else 1):
-            shape = primitive_of(fit.kind, fit.p)
-            bundle = candidate.rays_with_background(candidates, sensor, errors, shape)
-            (fit,) = refit_same_kind(fit, bundle, sensor, options.fit)
-        if errors.reach:
-            bundle = candidate.rays_with_background(candidates, sensor, errors, primitive_of(fit.kind, fit.p))
-        cost = float(exact_costs(fit.kind, fit.p[None], bundle, sensor, options.evidence)[0])
-        return expand_in_bias(fit, cost if math.isfinite(cost) else fit.cost, bundle, sensor, options.scanner)
-
-    return Profile(errors, list(pool.map(expand, zip(candidates, fits, strict=True))))
 
 
 def expand_in_bias(
@@ -328,38 +361,6 @@ def expand_in_bias(
     return BiasExpansion(fit, cost, float(score), max(float(curvature), 0.0), -jacobian @ inverse @ crossed)
 
 
-def with_best_bias(
-    pool: Executor,
-    candidates: Sequence[Candidate],
-    sensor: BeamModel,
-    errors: ScannerErrors,
-    fits: Sequence[KindFit],
-) -> Profile:
-    """Find the likeliest range bias by Gauss and Newton's method.
-
-    Each step is the candidates' mean, weighted by what they know, without those far from their median.
-
-    Args:
-        pool: The threads.
-        candidates: The candidates.
-        sensor: The sensor.
-        errors: The errors to begin with.
-        fits: The fits to begin with.
-
-    Returns:
-        The profile there.
-    """
-    options = candidates[0].options.scanner
-    profile = profile_at(pool, candidates, sensor, errors, fits)
-    for _ in range(options.steps):
-        step = min(max(common_step(profile, sensor, options)[0], -options.max_step), options.max_step)
-        bias = min(max(profile.errors.range_bias + step, -options.max_bias), options.max_bias)
-        if abs(bias - profile.errors.range_bias) < options.last_step:
-            break
-        profile = profile_at(pool, candidates, sensor, replace(profile.errors, range_bias=bias), profile.fits)
-    return profile
-
-
 def common_step(
     profile: Profile, sensor: BeamModel, options: ScannerOptions = DEFAULTS.scanner
 ) -> tuple[float, float]:
@@ -374,7 +375,8 @@ def common_step(
         Their weighted mean (m), without those that lie far from the median, and its standard deviation, no less than
         the scatter between them says; 0 and infinity where none knows anything.
     """
-    steps, known = profile.steps()
+    knowing = [one for one in profile.expansions if one.curvature > 0]
+    steps, known = np.array([one.step for one in knowing]), np.array([one.curvature for one in knowing])
     if not len(steps):
         return 0.0, math.inf
     own = np.sqrt(sensor.dispersion / known)
@@ -389,24 +391,17 @@ def common_step(
     return mean, math.sqrt(excess * sensor.dispersion / weights.sum())
 
 
-def bias_std(profile: Profile, sensor: BeamModel, options: ScannerOptions = DEFAULTS.scanner) -> float:
-    """Return the standard deviation (m) of a profile's range bias."""
-    return common_step(profile, sensor, options)[1]
-
-
-def is_biased(profile: Profile, sensor: BeamModel, options: ScannerOptions = DEFAULTS.scanner) -> bool:
-    """Tell whether a profile's range bias is significant."""
-    bias = abs(profile.errors.range_bias)
-    return bias >= max(options.min_bias, options.deviations * bias_std(profile, sensor, options))
-
-
 def mixed_pixels(
-    candidates: Sequence[Candidate], sensor: BeamModel, options: ScannerOptions = DEFAULTS.scanner
+    trusted: Sequence[Candidate],
+    candidates: Sequence[Candidate],
+    sensor: BeamModel,
+    options: ScannerOptions = DEFAULTS.scanner,
 ) -> float:
     """Find the half-width of beams within which silhouettes give ranges between two surfaces.
 
     Args:
-        candidates: The fitted candidates.
+        trusted: The fitted candidates that are asked.
+        candidates: All candidates.
         sensor: The sensor.
         options: The half-widths and the thresholds.
 
@@ -415,7 +410,7 @@ def mixed_pixels(
         before, are mixed; 0 where the smallest has few.
     """
     held, between = np.zeros(len(options.mixed)), np.zeros(len(options.mixed))
-    for candidate in candidates:
+    for candidate in trusted:
         bundle = candidate.rays_with_background(candidates, sensor)
         for counts, masks in zip(
             (held, between), silhouette_readings(bundle, candidate.current, options.mixed, sensor), strict=True

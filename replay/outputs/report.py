@@ -101,7 +101,9 @@ def _report(result: ReplayResult) -> dict[str, Any]:
 def _sensor_errors(detections: DetectionResult | None) -> dict[str, Any] | None:
     """Return the scanner's errors that refinement corrected; None where there are none."""
     errors = detections.detections.sensor if detections else None
-    return errors and {
+    if errors is None:
+        return None
+    return {
         "range_bias_m": errors.range_bias,
         "range_bias_std_m": errors.range_bias_std,
         "nearest_within_rad": errors.nearest_within,

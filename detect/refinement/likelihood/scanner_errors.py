@@ -115,7 +115,7 @@ def without_errors(
 
 
 def _occlusion(rays: FloatArray, occluders: Sequence[Primitive], turns: Sequence[float]) -> FloatArray:
-    """Return where (N,) the nearest of rays turned by some angles (rad) meets one of some shapes (m); FAR for none."""
+    """Return where (N,) the nearest of rays turned by some angles (rad) meets some shapes (m); FAR for none."""
     nearest = np.full(rays.shape[1], FAR)
     for turn in turns if occluders else ():
         turned = _turned(rays, turn)
