@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from mapping.grid import GridFrame
 from prim.errors import UsageError, WorldError
@@ -26,6 +27,10 @@ from replay.scans.posed_scans import PosedScans
 from replay.scans.scan_log import ScanLog
 from replay.timing import RatePacer, StageTimer
 from replay.viewing.protocol import NullViewer, Scene, Viewer
+
+if TYPE_CHECKING:
+    from detect.detection import SensorErrors
+    from replay.detection.stage import DetectionResult
 
 Progress = Callable[[int, int], None]
 
@@ -240,7 +245,7 @@ class Pipeline:
                 notes=(
                     *notes,
                     *branch.notes(outcome.grid),
-                    *sensor_notes(outcome.detections),
+                    *sensor_notes(_sensor_errors(outcome.detections)),
                 ),
                 messages_lost=log.messages_lost,
                 poses=posed_scans.poses,
@@ -279,6 +284,11 @@ class Pipeline:
         except BaseException:
             self.viewer.abandon()
             raise
+
+
+def _sensor_errors(result: DetectionResult | None) -> SensorErrors | None:
+    """Return the errors of the scanner that refinement corrected; None for none."""
+    return result.detections.sensor if result else None
 
 
 def _added(a: Mapping[str, float], b: Mapping[str, float]) -> dict[str, float]:

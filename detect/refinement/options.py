@@ -83,6 +83,9 @@ class SensorOptions:
     """m; footprints that are tried; the first two count as none."""
     same_noise: float = 0.03
     """Noise that differs by a smaller share does not make fits anew."""
+    beam_parts: tuple[float, ...] = (0.0, -0.5, 0.5, -1.0, 1.0)
+    """Directions within a wide beam, in half-widths, of which the nearest surface is read: the axis first, so that it
+    stays where none is nearer."""
     beyond: float = 2.45
     """Range noises; a range that is more beyond a surface is not explained by that,"""
     unexplained: float = -3.0

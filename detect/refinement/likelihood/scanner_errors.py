@@ -40,11 +40,6 @@ from prim.arrays import FloatArray
 from prim.se2 import rotate
 from prim.shapes import Primitive
 
-SUBRAYS = (0.0, -0.5, 0.5, -1.0, 1.0)
-"""Directions within a beam among which the nearest surface is searched, in half-widths; the axis comes first, so that
-it stays where none is nearer.
-"""
-
 
 @dataclass(frozen=True)
 class ScannerErrors:
@@ -110,7 +105,7 @@ def without_errors(
         mixed = silhouette_readings(bundle.with_rays(rays), shape, (errors.mixed,), sensor)[1][0]
         rays[OCCLUSION, mixed] = 0.0
     if errors.reach:
-        _turn_to_nearest(rays, shape, errors.reach)
+        _turn_to_nearest(rays, shape, [share * errors.reach for share in sensor.options.beam_parts])
     return bundle.with_rays(rays)
 
 
@@ -133,14 +128,14 @@ def _turned(rays: FloatArray, turn: float) -> FloatArray:
     return turned
 
 
-def _turn_to_nearest(rays: FloatArray, shape: Primitive, reach: float) -> None:
-    """Turn rays (7, N) to where a shape is nearest within a reach (rad).
+def _turn_to_nearest(rays: FloatArray, shape: Primitive, turns: Sequence[float]) -> None:
+    """Turn rays (7, N) to where a shape is nearest, by one of some angles (rad).
 
     Near a silhouette they are turned towards the shape, so that they hit it as long as any part of the beam does;
     the measured range is raised by what the shape is further away there than where it is nearest.
     """
     number, p, every = NUMBERS[shape.kind], parameters_of(shape), np.arange(rays.shape[1])
-    turned = [_turned(rays, share * reach) for share in SUBRAYS]
+    turned = [_turned(rays, turn) for turn in turns]
     ranges, clearances = np.empty((2, len(turned), rays.shape[1]))
     for one, away, aside in zip(turned, ranges, clearances, strict=True):
         cast_rays(OUTLINES, number, p, one, away)
