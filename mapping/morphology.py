@@ -60,6 +60,34 @@ def connected_components(
     return np.asarray(labels, dtype=np.int32), is_large[labels]
 
 
+def label(cells: BoolGrid) -> NDArray[np.int32]:
+    """Label the connected components of marked cells (8 neighbours): from 1 on, 0 where a cell is not marked."""
+    import cv2
+
+    return np.asarray(cv2.connectedComponents(cells.view(np.uint8), connectivity=8)[1], dtype=np.int32)
+
+
+def component_around(solid: BoolGrid, own: BoolGrid) -> BoolGrid | None:
+    """Find the connected component (4 neighbours) of cells with the most cells in a region.
+
+    Links of one cell's width are cut outside of the region (a morphological opening by 3 x 3 cells).
+
+    Args:
+        solid: The cells (rows, cols).
+        own: The region (rows, cols).
+
+    Returns:
+        The component's cells (rows, cols); None where none is in the region.
+    """
+    import cv2
+
+    opened = cv2.morphologyEx(solid.view(np.uint8), cv2.MORPH_OPEN, np.ones((3, 3), np.uint8)).view(np.bool_)
+    labels = cv2.connectedComponents((opened | (solid & own)).view(np.uint8), connectivity=4)[1]
+    counts = np.bincount(labels[own], minlength=2)
+    counts[0] = 0
+    return np.asarray(labels == counts.argmax()) if counts.any() else None
+
+
 def chessboard_distances(occupied: BoolGrid) -> NDArray[np.uint8]:
     """Compute the chessboard distance (cells) of each cell to the nearest occupied one, or to beyond the map.
 
@@ -74,3 +102,24 @@ def chessboard_distances(occupied: BoolGrid) -> NDArray[np.uint8]:
     others = np.pad(~occupied, 1).view(np.uint8)
     distances = cv2.distanceTransform(others, cv2.DIST_C, cv2.DIST_MASK_3)[1:-1, 1:-1]
     return np.minimum(distances, np.iinfo(np.uint8).max).astype(np.uint8)
+
+
+def outer_contour(cells: BoolGrid, tolerance: float) -> NDArray[np.float64]:
+    """Return the outer contour of the largest connected component of cells, holes filled, as a simplified polygon.
+
+    Args:
+        cells: Marked cells (rows, cols), at least one.
+        tolerance: How far the polygon may be off (cells; Douglas and Peucker 1973).
+
+    Returns:
+        Vertices (V, 2) as column and row, in cells from the grid's first corner, counter-clockwise.
+    """
+    import cv2
+
+    doubled = np.repeat(np.repeat(cells.view(np.uint8), 2, axis=0), 2, axis=1)  # a cell's own width shows
+    contours, _ = cv2.findContours(np.pad(doubled, 1), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
+    largest = max(contours, key=cv2.contourArea)
+    simple = cv2.approxPolyDP(largest, 2 * tolerance, True)[:, 0].astype(np.float64)
+    area = float(np.cross(simple, np.roll(simple, -1, axis=0)).sum()) if len(simple) > 2 else 0.0
+    ordered = simple if area >= 0 else simple[::-1]
+    return np.asarray((ordered - 1.0 + 0.5) / 2)

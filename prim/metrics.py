@@ -98,6 +98,24 @@ def polygon_iou(a: Primitive, b: Primitive) -> float:
     return shared / union if union > 0 else 0.0
 
 
+def outline_iou(a: FloatArray, b: FloatArray) -> float:
+    """Compute the intersection over union of two closed outlines, which may be any polygons.
+
+    Args:
+        a: Vertices (V, 2) of one (m).
+        b: Vertices (W, 2) of the other.
+
+    Returns:
+        From 0 to 1; 0 where neither has an area.
+    """
+    import shapely
+
+    first, second = (shapely.make_valid(shapely.Polygon(vertices)) for vertices in (a, b))
+    shared = shapely.intersection(first, second, grid_size=OVERLAY_GRID).area
+    union = first.area + second.area - shared
+    return float(shared / union) if union > 0 else 0.0
+
+
 def overlap_coefficient(a: Primitive, b: Primitive) -> float:
     """Compute the overlap coefficient of two outlines' polygons: their intersection over the smaller one's area.
 

@@ -30,9 +30,12 @@ ARROWS: dict[str, set[str]] = {
     "detect/refinement/likelihood": {"prim", "mapping", "detect/refinement"},
     "detect/refinement/surroundings": {"prim", "mapping", "detect/refinement"},
     "detect/refinement/fitting": {"prim", "detect/refinement", "detect/refinement/likelihood"},
+    "detect/refinement/outlines": {
+        "prim", "mapping", "detect/refinement", "detect/refinement/likelihood", "detect/refinement/surroundings",
+    },
     "detect/refinement": {
         "prim", "mapping", "detect", "detect/refinement/fitting", "detect/refinement/likelihood",
-        "detect/refinement/surroundings",
+        "detect/refinement/outlines", "detect/refinement/surroundings",
     },
     "detect": {"prim", "mapping", "detect/networks"},
     "detect/training": {
@@ -77,6 +80,7 @@ ENDS = {
     ("detect/refinement/likelihood", "detect/refinement"): {"options"},
     ("detect/refinement/surroundings", "detect/refinement"): {"options"},
     ("detect/refinement/fitting", "detect/refinement"): {"options"},
+    ("detect/refinement/outlines", "detect/refinement"): {"options"},
     ("replay/detection", "detect/refinement/surroundings"): {"map_cells"},
     ("replay", "detect/refinement/surroundings"): {"map_cells"},
     ("replay/viewing", "replay"): {"result"},

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from detect.detection import Detection
 from detect.refinement.fitting.evidence import laplace_evidence, max_size
 from detect.refinement.fitting.fit import SPECIAL_CASES, KindFit, fit_all_kinds, refit, refit_same_kind
-from detect.refinement.likelihood.geometry import JACOBIANS, parameters_of, primitive_of
+from detect.refinement.likelihood.geometry import JACOBIANS, parameters_of, primitive_of, ranges_to
 from detect.refinement.likelihood.rays import RayBundle
 from detect.refinement.likelihood.scanner_errors import (
     NO_ERRORS,
@@ -29,6 +29,7 @@ from detect.refinement.likelihood.sensor_model import (
     with_background,
 )
 from detect.refinement.options import DEFAULTS, RefinementOptions
+from detect.refinement.outlines.free_outline import ranges_of
 from detect.refinement.surroundings.map_cells import MapCells
 from detect.refinement.surroundings.walls import Wall, walls_behind
 from prim.arrays import FloatArray
@@ -53,6 +54,7 @@ class Candidate:
         errors: Errors of the scanner, which are taken out of its rays.
         shared_errors: (5, E) by how much its parameters change with one standard deviation of each error of the
             scanner; None for none.
+        outline: Vertices (V, 2) in m of a free outline, where the rays say that no kind fits; else None.
         current: The primitive as far as it is known.
     """
 
@@ -68,6 +70,7 @@ class Candidate:
     is_rough: bool = False
     errors: ScannerErrors = NO_ERRORS
     shared_errors: FloatArray | None = None
+    outline: FloatArray | None = None
     current: Primitive = field(init=False)
     _cached: tuple[Background, float, FloatArray] | None = None
 
@@ -97,24 +100,31 @@ class Candidate:
         if self._cached is None or self._cached[0] is not background or self._cached[1] != sensor.std:
             self._cached = background, sensor.std, background_log_likelihood(self.bundle, background, sensor)
         reach = self.options.map.occluder_distance
-        near = [
-            other.current
-            for other in others
-            if other is not self and centroid_distance(other.start, self.start) < reach
-        ]
+        near = [other for other in others if other is not self and centroid_distance(other.start, self.start) < reach]
+        shapes = [other.current for other in near if other.outline is None]
         walls = [wall.stretch for wall in self.walls]
+        occlusion = [ranges_of(other.outline, self.bundle) for other in near if other.outline is not None]
         errors = self.errors if errors is None else errors
         if errors != NO_ERRORS:
-            around = Surroundings(background, self._cached[2], near, walls)
+            around = Surroundings(background, self._cached[2], shapes, walls, occlusion)
             return without_errors(self.bundle, around, shape or self.current, sensor, errors)
-        occluders = [*near, *walls]
-        return with_background(self.bundle, background, self._cached[2], occluders, sensor)
+        return with_background(self.bundle, background, self._cached[2], [*shapes, *walls], sensor, occlusion)
 
     def keep_rays(self, chosen: NDArray[np.bool_]) -> None:
         """Leave out all rays but the chosen ones (N,)."""
         self.bundle = self.bundle.select(chosen)
         self.background = self.background and self.background.select(chosen)
         self.fitted_to = self.fitted_to and (self.fitted_to[0], self.fitted_to[1].select(chosen))
+
+    @property
+    def fitted_rays(self) -> RayBundle:
+        """The rays, with their background, that it was fitted to last."""
+        assert self.fitted_to is not None
+        return self.fitted_to[1]
+
+    def surface_ranges(self, bundle: RayBundle) -> FloatArray:
+        """Return the ranges (N,) in m at which rays meet its free outline, else the primitive; FAR for a miss."""
+        return ranges_to(self.current, bundle.rays) if self.outline is None else ranges_of(self.outline, bundle)
 
     @property
     def known_fit(self) -> KindFit:

@@ -81,6 +81,8 @@ class SensorOptions:
     """m; silhouettes are blurred by this much at least where scores are taken."""
     footprints: tuple[float, ...] = (0.0, 0.0005, 0.001, 0.002, 0.004, 0.008, 0.016)
     """m; footprints that are tried; the first two count as none."""
+    misfit_rounds: int = 2
+    """How often, at most, what fits no kind is sought with the noise that is known by then."""
     same_noise: float = 0.03
     """Noise that differs by a smaller share does not make fits anew."""
     beam_parts: tuple[float, ...] = (0.0, -0.5, 0.5, -1.0, 1.0)
@@ -119,6 +121,8 @@ class ScannerOptions:
     """nats a candidate, and above the dispersion, by which beams of a width must be likelier than without."""
     reaches: tuple[float, ...] = (0.0015, 0.003, 0.006, 0.012, 0.024)
     """rad; half-widths of beams that are tried: 0.09 to 1.4 degrees."""
+    first_reach: float = 0.003
+    """rad; where none up to this is likelier than no width, for most candidates, no others are tried."""
     refinements: int = 3
     """Halvings of the interval around the best."""
     turns: int = 3
@@ -357,6 +361,143 @@ class AcceptanceOptions:
 
 
 @dataclass(frozen=True)
+class OutlineOptions:
+    """Free outlines: a primitive's outline deformed by harmonics."""
+
+    vertices: int = 64
+    """Vertices that stand for a deformed outline, about."""
+    harmonics: int = 16
+    """Harmonics of the deformation."""
+    amplitudes: tuple[float, ...] = (0.1, 0.5)
+    """Standard deviations of the first harmonic under the priors that are tried, as shares of the radius,"""
+    decay: float = 2.0
+    """of harmonic k by k to the power of minus this."""
+    growth: tuple[float, float] = (-2.0, 1.0)
+    """Bounds of the logarithm of a radius over the primitive's."""
+    descent: Descent = Descent((0.012, 0.004, 0.001), 12, 0.1)
+    """From the primitive's outline."""
+    test_blur: float = 0.012
+    """m; of silhouettes in the score test: further than from there no step of it reaches."""
+    suspicious: float = 5.0
+    """nats; only where the score test promises a gain of so much is a free outline fitted."""
+    least_blur: float = 0.0005
+    """m; of silhouettes: at narrower ones single rays count for all."""
+    footprint: float = 0.002
+    """m; half-width of silhouettes while the sensor's own is not known."""
+    first_damping: float = 1e-2
+    """As those of FitOptions."""
+    min_damping: float = 1e-6
+    max_damping: float = 1e4
+    damping_after_success: float = 0.2
+    damping_after_failure: float = 8.0
+    information_blur: float = 0.001
+    """m; as FitOptions.information_blur."""
+
+
+@dataclass(frozen=True)
+class PolygonOptions:
+    """Free polygons, from the contour of a candidate's cells."""
+
+    around: float = 0.08
+    """m; the contour is searched this far around the candidate's circle,"""
+    around_cells: float = 6.0
+    """cells; and this far at least."""
+    others: float = 1.5
+    """cells; cells this near to another candidate are that one's,"""
+    wall: float = 2.5
+    """cells; and those this near to a wall's line the wall's."""
+    simplification: float = 1.2
+    """cells; tolerance of the contour's first polygon."""
+    vertices: tuple[int, int] = (3, 60)
+    """Fewest and most vertices."""
+    round_vertices: tuple[int, ...] = (5, 6, 8)
+    """Vertices of polygons that begin as circles or ellipses."""
+    search_rays: int = 1500
+    """Rays that the number of vertices is chosen with, about."""
+    coarse: Descent = Descent((0.012, 0.004, 0.001), 8, 0.3)
+    """From the contour, to some of the rays."""
+    reduction: Descent = Descent((0.004, 0.001), 5, 0.3)
+    """With a vertex less."""
+    fine: Descent = Descent((0.004, 0.001), 8, 0.1)
+    """To all rays."""
+    tries: int = 3
+    """Vertices whose removal is tried, those that span the smallest triangles, before all stay."""
+    pull: float = 0.04
+    """m; standard deviation of vertices about where a descent begins: the contour is no further off."""
+    spread: float = 0.35
+    """m; standard deviation of vertices about the first one under the prior: half of EvidenceOptions.max_extent."""
+    vertex_odds: float = 2.0
+    """By this factor a polygon with one more vertex is less likely a priori."""
+    least_blur: float = 0.0005
+    """m; of silhouettes."""
+    information_blur: float = 0.001
+    """m; as FitOptions.information_blur."""
+    first_damping: float = 1e-2
+    """As those of FitOptions."""
+    min_damping: float = 1e-6
+    max_damping: float = 1e4
+    damping_after_success: float = 0.2
+    damping_after_failure: float = 8.0
+
+
+@dataclass(frozen=True)
+class ContactOptions:
+    """When a candidate is a part of something larger."""
+
+    occluder_distance: float = 2.5
+    """m; as MapOptions.occluder_distance."""
+    edge: float = 0.5
+    """cells; unexplained cells touch a candidate where they are further off its outline than this"""
+    touch: float = 2.5
+    """cells; and no further than this."""
+    far: float = 0.15
+    """m; cells connected with these count up to this far from the outline,"""
+    far_cells: float = 8.0
+    """cells; and up to this far at least."""
+    own: float = 0.02
+    """m; another primitive explains cells this near,"""
+    own_cells: float = 1.5
+    """cells; or this near;"""
+    wall_width: float = 0.035
+    """m; a wall those this near to its line,"""
+    wall_width_cells: float = 1.6
+    """cells; or this near."""
+    wall_depth: float = 0.02
+    """m; a candidate that reaches further behind a wall's line is not explained by it,"""
+    wall_depth_cells: float = 0.4
+    """cells; this far at least."""
+    strip: tuple[float, ...] = (2.0, 3.0, 4.0)
+    """cells; distances from a wall's line of the strip beside a candidate …"""
+    free_share: float = 0.5
+    """… of which more than this share is free: else the candidate is a part of what stands behind the wall."""
+    beside: float = 1.5
+    """cells; the strip begins this far beside the candidate."""
+    cleared: float = 0.02
+    """m; cells this near to primitives are theirs."""
+    passing: float = 0.002
+    """m; rays whose line passes a candidate by more count."""
+    min_nats: float = 20.0
+    """nats; what touches a candidate makes it a part where the rays are likelier with it by more. Primitives that
+    stand alone or at walls come to 1 at most (trial of 331 and 114)."""
+
+
+@dataclass(frozen=True)
+class OtherOptions:
+    """When a candidate is none of the kinds."""
+
+    prior: float = 0.5
+    """Prior probability of «none of the kinds»; the kinds share the rest evenly."""
+    min_difference: float = 0.025
+    """A free outline that has more than 1 minus this in common with a kind (IoU) is that kind: real things are not
+    exact."""
+    polygon_handicap: float = 5.0
+    """nats; by which polygons are less likely a priori than deformed primitives: their number of vertices is chosen
+    by the same rays."""
+    min_gain: float = 5.0
+    """nats; only where the score test promises a gain of so much are free outlines fitted."""
+
+
+@dataclass(frozen=True)
 class StandingOptions:
     """When the rays of some scans contradict a fit to those of others."""
 
@@ -383,6 +524,10 @@ class RefinementOptions:
     walls: WallOptions = field(default_factory=WallOptions)
     proposals: ProposalOptions = field(default_factory=ProposalOptions)
     acceptance: AcceptanceOptions = field(default_factory=AcceptanceOptions)
+    outline: OutlineOptions = field(default_factory=OutlineOptions)
+    polygon: PolygonOptions = field(default_factory=PolygonOptions)
+    contact: ContactOptions = field(default_factory=ContactOptions)
+    other: OtherOptions = field(default_factory=OtherOptions)
     standing: StandingOptions = field(default_factory=StandingOptions)
     closed_world: bool = False
     """Whether all there is are the kinds and walls: nothing is held against «none of the kinds»."""

@@ -17,19 +17,27 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from concurrent.futures import Executor, ThreadPoolExecutor
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from detect.detection import Detection, Detections, Rejection, SensorErrors
+from detect.detection import Detection, Detections, Rejection, SensorErrors, UnknownObject
 from detect.refinement.candidates import Candidate, find_backgrounds, fit_candidates
 from detect.refinement.fitting.evidence import compare_kinds
 from detect.refinement.likelihood.geometry import parameters_of, ranges_to
 from detect.refinement.likelihood.kernels import BACKGROUND, OCCLUSION
 from detect.refinement.likelihood.rays import RayBundle, collect_rays
 from detect.refinement.likelihood.sensor_model import Background, BeamModel, DistanceMap, surface_likelihood
-from detect.refinement.options import DEFAULTS, AcceptanceOptions, RefinementOptions
-from detect.refinement.scanner_errors import correct_scanner_errors, with_shared_errors
+from detect.refinement.misfits import sensor_without_misfits
+from detect.refinement.options import DEFAULTS, AcceptanceOptions, OtherOptions, RefinementOptions
+from detect.refinement.other import (
+    Alternative,
+    free_alternatives,
+    larger_alternative,
+    other_log_odds,
+    simple_outline,
+)
+from detect.refinement.scanner_errors import correct_scanner_errors, settle_scanner_errors, with_shared_errors
 from detect.refinement.sensor_estimation import estimate_noise, estimate_sensor, initial_noise
 from detect.refinement.surroundings.map_cells import MapCells
 from detect.refinement.surroundings.proposals import propose
@@ -39,6 +47,9 @@ from prim.metrics import overlap_coefficient
 from prim.scan import Scan
 from prim.se2 import Pose2D
 from prim.shapes import Kind, Primitive
+
+MAX_LOG_ODDS = 700.0
+"""Nats beyond which odds are as good as none: the exponential is finite."""
 
 
 @dataclass(frozen=True)
@@ -54,6 +65,9 @@ class RefinedPrimitive:
         misfit: By how much the map alone explains the rays that meet it better (nats a ray).
         rays: How many rays meet it.
         seen: Share of the directions around it in which they do.
+        other_probability: Posterior probability that it is none of the kinds, whose own probabilities are those given
+            that it is one.
+        alternative: What it is likeliest instead; None where nothing else was found.
     """
 
     primitive: Primitive
@@ -64,11 +78,35 @@ class RefinedPrimitive:
     misfit: float
     rays: int
     seen: float
+    other_probability: float = 0.0
+    alternative: Alternative | None = None
 
     @property
     def score(self) -> float:
         """The posterior probability of its kind."""
-        return self.kind_probabilities[self.primitive.kind]
+        return (1 - self.other_probability) * self.kind_probabilities[self.primitive.kind]
+
+    @property
+    def is_other(self) -> bool:
+        """Whether it is likelier none of the kinds than one of them."""
+        return self.alternative is not None and self.other_probability > 0.5
+
+    def beside(self, alternatives: Sequence[Alternative], options: OtherOptions) -> RefinedPrimitive:
+        """Hold the kinds against alternatives.
+
+        Args:
+            alternatives: What else it may be; none where nothing was found.
+            options: The prior.
+
+        Returns:
+            The result with the posterior probability of «none of the kinds».
+        """
+        if not alternatives:
+            return self
+        likeliest = self.kind_probabilities[self.primitive.kind]
+        probability = 1 / (1 + math.exp(-max(other_log_odds(alternatives, likeliest, options), -MAX_LOG_ODDS)))
+        best = max(alternatives, key=lambda one: one.log_odds)
+        return replace(self, other_probability=probability, alternative=best)
 
 
 @dataclass(frozen=True)
@@ -143,6 +181,7 @@ def refine_detections(
     )
     refined = refinement.run(starts, scans, known, found, [detection.since for detection in wanted])
     kept: list[Detection] = []
+    objects: list[UnknownObject] = []
     rejected = []
     for number, (guess, result) in enumerate(zip(wanted, refined, strict=True)):
         if number < found:
@@ -151,13 +190,17 @@ def refine_detections(
             reason = proposal_rejection_reason(result, guess.primitive, cells, options.acceptance)
         if result is None or reason:
             rejected.append(_rejection(guess, result, reason))
+        elif result.is_other:
+            objects.append(object_of(result, guess.since))
         else:
             kept.append(detection_of(result, guess))
     judged = {id(rejection) for doubtful, rejection in detections.doubtful if id(doubtful) in undecided}
     rejected += [rejection for rejection in detections.rejected if id(rejection) not in judged]
     kept.sort(key=lambda detection: -detection.score)
     rejected.sort(key=lambda rejection: -rejection.score)
-    return Detections(tuple(kept), tuple(rejected), sensor=refinement.sensor), refinement.noise_std if kept else None
+    objects.sort(key=lambda found: -found.score)
+    noise = refinement.noise_std if kept or objects else None
+    return Detections(tuple(kept), tuple(rejected), objects=tuple(objects), sensor=refinement.sensor), noise
 
 
 def _candidates_of(
@@ -255,8 +298,9 @@ def proposal_rejection_reason(
         return f"{prefix}it reaches into a wall"
     if overlap_coefficient(result.primitive, guess) < limits.min_shared:
         return f"{prefix}what explains its rays stands elsewhere"
-    if result.score < limits.min_kind_probability:
-        return f"{prefix}the probability of its kind is {result.score:.2f}, less than {limits.min_kind_probability:g}"
+    probability = result.kind_probabilities[result.primitive.kind]
+    if probability < limits.min_kind_probability:
+        return f"{prefix}the probability of its kind is {probability:.2f}, less than {limits.min_kind_probability:g}"
     return ""
 
 
@@ -283,10 +327,32 @@ def detection_of(result: RefinedPrimitive, guess: Detection | None = None) -> De
         (x0, y0, x1, y1),
         np.zeros((0, 0), np.uint8) if guess is None else guess.crop,
         result.std,
-        result.kind_probabilities,
+        _share_of_kinds(result),
         result.covariance,
         None if guess is None else guess.since,
+        result.other_probability,
     )
+
+
+def _share_of_kinds(result: RefinedPrimitive) -> dict[Kind, float]:
+    """Return the kinds' probabilities; with that of «none of the kinds» they sum to 1."""
+    return {kind: (1 - result.other_probability) * share for kind, share in result.kind_probabilities.items()}
+
+
+def object_of(result: RefinedPrimitive, since: int | None = None) -> UnknownObject:
+    """Return what is likeliest none of the kinds.
+
+    Args:
+        result: What was refined.
+        since: As Detection.since.
+
+    Returns:
+        The object, with the outline of the likeliest alternative.
+    """
+    assert result.alternative is not None
+    outline = simple_outline(result.alternative.vertices)
+    std, reason = result.alternative.std, result.alternative.reason
+    return UnknownObject(outline, std, result.other_probability, reason, _share_of_kinds(result), since)
 
 
 @dataclass
@@ -363,14 +429,47 @@ class Refinement:
         noise = known_noise or estimate_noise(single, sensor)
         sensor = BeamModel.create(noise, span, max_std=max_noise, options=options.sensor)
         self._fit_jointly(pool, single, sensor)
+        sensor = correct_scanner_errors(pool, single, sensor, known_noise)
+        if not options.closed_world:
+            sensor = sensor_without_misfits(pool, single, sensor, known_noise)
+        sensor, self.sensor = settle_scanner_errors(pool, single, sensor, known_noise)
         sensor = estimate_sensor(single, sensor, known_noise)
-        sensor, self.sensor = correct_scanner_errors(pool, single, sensor, known_noise)
         disperses = sensor.dispersion > options.sensor.significant_dispersion
         fit_candidates(pool, single, [disperses] * len(single), sensor)
         self.noise_std = sensor.std
         whole_map = DistanceMap.of(self.cells.occupied, self.cells.frame)
         finished = pool.map(lambda item: finish(item, whole_map.background(item.bundle), sensor), single)
-        return {id(candidate): result for candidate, result in zip(single, finished, strict=True)}
+        results = {id(candidate): result for candidate, result in zip(single, finished, strict=True)}
+        return results if options.closed_world else self._beside_others(pool, single, results, sensor)
+
+    def _beside_others(
+        self,
+        pool: Executor,
+        candidates: list[Candidate],
+        results: dict[int, RefinedPrimitive | None],
+        sensor: BeamModel,
+    ) -> dict[int, RefinedPrimitive | None]:
+        """Hold results against «none of the kinds»: shapes of their own first, then parts of something larger."""
+        limits, other = self.options.acceptance, self.options.other
+        asked = [one for one in candidates if one.known is None and not rejection_reason(results[id(one)], limits)]
+        found = pool.map(lambda one: free_alternatives(one, one.fitted_rays, candidates, sensor), asked)
+        shapes = {id(one): alternatives for one, alternatives in zip(asked, found, strict=True)}
+        beside = dict(results)
+        for key, alternatives in shapes.items():
+            beside[key] = _required(results[key]).beside(alternatives, other)
+        kept = {
+            id(one): _required(beside[id(one)]).primitive for one in candidates if _is_kept(beside[id(one)], limits)
+        }
+        rest = [one for one in asked if id(one) in kept]
+
+        def larger(one: Candidate) -> Alternative | None:
+            others = [primitive for key, primitive in kept.items() if key != id(one)]
+            return larger_alternative(one, kept[id(one)], others, sensor)
+
+        for one, alternative in zip(rest, pool.map(larger, rest), strict=True):
+            if alternative is not None:
+                beside[id(one)] = _required(results[id(one)]).beside([*shapes[id(one)], alternative], other)
+        return beside
 
     def _near_rays(self, candidates: list[Candidate]) -> list[Candidate]:
         """Leave out rays that pass far from the fits, and candidates without any."""
@@ -388,6 +487,17 @@ class Refinement:
             moved = (np.abs(p - at).max() for p, at in zip(now, before, strict=True))
             if all(change < self.options.converged for change in moved):
                 break
+
+
+def _required(result: RefinedPrimitive | None) -> RefinedPrimitive:
+    """Return a result that is known to be there."""
+    assert result is not None
+    return result
+
+
+def _is_kept(result: RefinedPrimitive | None, limits: AcceptanceOptions) -> bool:
+    """Tell whether a result is one of the kinds, and nothing speaks against it."""
+    return result is not None and not result.is_other and not rejection_reason(result, limits)
 
 
 def without_duplicates(
@@ -441,8 +551,7 @@ def finish(candidate: Candidate, map_alone: Background, sensor: BeamModel) -> Re
     Returns:
         The result; None where no kind is possible there.
     """
-    assert candidate.fitted_to is not None
-    bundle = candidate.fitted_to[1]
+    bundle = candidate.fitted_rays
     evidence = candidate.options.evidence
     posterior = compare_kinds(candidate.fits, bundle, sensor, candidate.is_possible, evidence)
     if posterior is None:

@@ -82,41 +82,54 @@ class Profile:
 
 
 def correct_scanner_errors(
-    pool: Executor,
-    candidates: Sequence[Candidate],
-    sensor: BeamModel,
-    noise_std: float | None,
-    trusted: Sequence[Candidate] | None = None,
-) -> tuple[BeamModel, SensorErrors | None]:
+    pool: Executor, candidates: Sequence[Candidate], sensor: BeamModel, noise_std: float | None
+) -> BeamModel:
     """Find the errors that all beams have in common, take them out of the candidates' rays, and fit anew.
 
     Args:
         pool: The threads.
         candidates: The fitted candidates; where errors are found, they are fitted anew, all kinds of them.
-        sensor: The sensor, estimated as if there were none.
+        sensor: The sensor so far: its noise.
         noise_std: The range noise (m) where it is known.
-        trusted: Those of the candidates that fit their rays, by which errors are found; None: all of them.
 
     Returns:
-        The sensor, estimated anew where errors were found, and these; None for none.
+        The sensor: the same where no errors are found, else estimated anew.
     """
-    trusted = candidates if trusted is None else trusted
-    if not trusted:
-        return sensor, None
-    search = ErrorSearch(pool, candidates, trusted, trusted[0].options.scanner)
-    errors = search.likeliest(sensor, ScannerErrors(mixed=mixed_pixels(trusted, candidates, sensor, search.options)))
+    search = ErrorSearch(pool, candidates, candidates, candidates[0].options.scanner)
+    estimated = estimate_sensor(candidates, sensor, noise_std)
+    errors = ScannerErrors(mixed=mixed_pixels(candidates, candidates, estimated, search.options))
+    errors = search.likeliest(estimated, errors)
+    if errors == NO_ERRORS:
+        return sensor
+    return search.take_out(errors, estimated, noise_std, search_kinds=True)
+
+
+def settle_scanner_errors(
+    pool: Executor, candidates: Sequence[Candidate], sensor: BeamModel, noise_std: float | None
+) -> tuple[BeamModel, SensorErrors | None]:
+    """Find the scanner's errors again by the candidates that a kind fits now, and what is unsure because of them.
+
+    Args:
+        pool: The threads.
+        candidates: The candidates, fitted without the errors that were found first; they are fitted again.
+        sensor: The sensor, estimated without them.
+        noise_std: The range noise (m) where it is known.
+
+    Returns:
+        The sensor, and the errors; the same sensor and None where none were found.
+    """
+    errors = candidates[0].errors
     if errors == NO_ERRORS:
         return sensor, None
-    for candidate in candidates:
-        candidate.errors, candidate.fitted_to = errors, None  # so that all kinds are searched
-    sensor = search.fit_again(sensor, noise_std)
+    trusted = [candidate for candidate in candidates if candidate.outline is None]
+    search = ErrorSearch(pool, candidates, trusted or candidates, candidates[0].options.scanner)
+    estimated = estimate_sensor(candidates, sensor, noise_std)
     if errors.range_bias or errors.reach:
-        errors = search.likeliest(sensor, errors)
-    for candidate in candidates:
-        candidate.errors = errors
-    sensor = search.fit_again(sensor, noise_std)
-    std = search.add_shared_errors(sensor, errors)
-    return sensor, SensorErrors(errors.range_bias, std, 2 * errors.reach, 2 * errors.mixed)
+        errors = search.likeliest(estimated, errors)
+    estimated = search.take_out(errors, estimated, noise_std, search_kinds=False)
+    std = search.add_shared_errors(estimated, errors)
+    found = SensorErrors(errors.range_bias, std, 2 * errors.reach, 2 * errors.mixed)
+    return estimated, found if errors != NO_ERRORS else None
 
 
 @dataclass(frozen=True)
@@ -155,9 +168,7 @@ class ErrorSearch:
         likeliest = self.with_best_bias(sensor, replace(known, reach=0.0), fits)
         if is_wide:
             footprint = 0.0 if known.reach else min(sensor.footprint, options.first_footprint)
-            wide = self._with_best_reach(replace(sensor, footprint=footprint), likeliest)
-            if likeliest.cost - wide.cost > options.min_gain * len(self.trusted) * sensor.dispersion:
-                likeliest = wide
+            likeliest = self._with_width(replace(sensor, footprint=footprint), likeliest)
         errors = likeliest.errors
         std = common_step(likeliest, sensor, options)[1]
         is_biased = abs(errors.range_bias) >= max(options.min_bias, options.deviations * std)
@@ -218,6 +229,20 @@ class ErrorSearch:
             profile = self.at(sensor, replace(profile.errors, range_bias=bias), profile.fits)
         return profile
 
+    def _with_width(self, sensor: BeamModel, start: Profile) -> Profile:
+        """Return the likeliest profile with beams of a width; the one to start with where none gains enough."""
+        options = self.options
+        for reach in options.reaches:
+            first = self.at(sensor, replace(start.errors, reach=reach), start.fits)
+            gains = [a.cost - b.cost for a, b in zip(start.expansions, first.expansions, strict=True)]
+            if float(np.median(gains)) > 0:
+                wide = self._with_best_reach(sensor, start)
+                enough = options.min_gain * len(self.trusted) * sensor.dispersion
+                return wide if start.cost - wide.cost > enough else start
+            if reach >= options.first_reach:
+                break
+        return start
+
     def _with_best_reach(self, sensor: BeamModel, start: Profile) -> Profile:
         """Return the likeliest profile with beams of a width: the best of some, then halfway to its neighbours."""
         found: dict[float, Profile] = {}
@@ -228,7 +253,9 @@ class ErrorSearch:
 
         near = start
         for reach in self.options.reaches:
-            near = add(reach, near)
+            before, near = near, add(reach, near)
+            if reach > self.options.first_reach and near.cost > before.cost:
+                break
         for _ in range(self.options.refinements):
             known = sorted(found)
             best = min(known, key=lambda reach: found[reach].cost)
@@ -237,21 +264,28 @@ class ErrorSearch:
                 add(0.5 * (best + other), found[best])
         return min(found.values(), key=lambda profile: profile.cost)
 
-    def fit_again(self, sensor: BeamModel, noise_std: float | None) -> BeamModel:
+    def take_out(
+        self, errors: ScannerErrors, sensor: BeamModel, noise_std: float | None, search_kinds: bool
+    ) -> BeamModel:
         """Fit all candidates without the scanner's errors, and estimate the sensor anew.
 
         Args:
+            errors: The errors.
             sensor: The sensor so far.
             noise_std: The range noise (m) where it is known.
+            search_kinds: Whether all kinds are fitted from new starts.
 
         Returns:
             The sensor.
         """
-        for _ in range(self.options.turns if self.candidates[0].errors.reach else 1):
+        for candidate in self.candidates:
+            candidate.errors = errors
+            candidate.fitted_to = None if search_kinds else candidate.fitted_to
+        for _ in range(self.options.turns if errors.reach else 1):
             for candidate in self.candidates:
                 candidate.is_rough = True  # so that it is fitted again though its background is the same
             fit_candidates(self.pool, self.candidates, [False] * len(self.candidates), sensor)
-        return estimate_sensor(self.trusted, sensor, noise_std)
+        return estimate_sensor(self.candidates, sensor, noise_std)
 
     def add_shared_errors(self, sensor: BeamModel, errors: ScannerErrors) -> float | None:
         """Set what is unsure about all candidates because the scanner's errors are.

@@ -48,6 +48,9 @@ def _residuals(bundle: RayBundle, primitive: Primitive) -> FloatArray:
 def estimate_sensor(candidates: Sequence[Candidate], sensor: BeamModel, noise_std: float | None) -> BeamModel:
     """Estimate noise, footprint and dispersion from all candidates together.
 
+    What fits no kind must not spoil them: noise is measured from free outlines where these fit better, and footprint
+    and dispersion are what most of the candidates agree on.
+
     Args:
         candidates: The fitted candidates.
         sensor: The sensor so far.
@@ -66,8 +69,16 @@ def estimate_sensor(candidates: Sequence[Candidate], sensor: BeamModel, noise_st
     return BeamModel.create(std, sensor.span, footprint, dispersion, sensor.max_std, sensor.options)
 
 
+def _without_outlines(candidates: Sequence[Candidate]) -> list[Candidate]:
+    """Return the candidates that a kind fits."""
+    return [candidate for candidate in candidates if candidate.outline is None]
+
+
 def estimate_footprint(candidates: Sequence[Candidate], sensor: BeamModel) -> float:
     """Find the footprint that makes the rays near candidates' silhouettes most likely.
+
+    Of the candidates that half counts, for each footprint, that it serves least: a shape that is wrong at its
+    silhouettes asks for a wide footprint, and no others do.
 
     Args:
         candidates: The fitted candidates.
@@ -78,15 +89,18 @@ def estimate_footprint(candidates: Sequence[Candidate], sensor: BeamModel) -> fl
     """
     footprints = sensor.options.footprints
     widest = footprints[-1]
-    totals = np.zeros(len(footprints))
-    for candidate in candidates:
+    fitting = _without_outlines(candidates)
+    costs = np.zeros((len(fitting), len(footprints)))
+    for row, candidate in zip(costs, fitting, strict=True):
         bundle, fit = candidate.rays_with_background(candidates, sensor), candidate.fits[0]
         at_edge = bundle.passing(candidate.current, widest) & ~bundle.passing(candidate.current, -widest)
         bundle = bundle.select(at_edge)
         for k, footprint in enumerate(footprints):
             cost = exact_costs(fit.kind, fit.p[None], bundle, replace(sensor, footprint=footprint))[0]
-            totals[k] += cost if np.isfinite(cost) else 0.0  # larger than the prior allows: no information
-    return float(footprints[best]) if (best := int(np.argmin(totals))) > 1 else 0.0
+            row[k] = cost if np.isfinite(cost) else 0.0  # larger than the prior allows: no information
+    more_than_none = np.sort(costs - costs[:, :1], axis=0)
+    total = more_than_none[len(costs) // 2 :].sum(axis=0)
+    return float(footprints[best]) if (best := int(np.argmin(total))) > 1 else 0.0
 
 
 def scan_dispersion(candidates: Sequence[Candidate], sensor: BeamModel) -> float:
@@ -97,13 +111,13 @@ def scan_dispersion(candidates: Sequence[Candidate], sensor: BeamModel) -> float
         sensor: The sensor.
 
     Returns:
-        1 or more.
+        1 or more: the median over the candidates, weighted by their scans.
     """
     options = sensor.options
-    squares, scans = 0.0, 0
+    found, scans = [], []
     for candidate in candidates:
         bundle = candidate.rays_with_background(candidates, sensor)
-        ranges = ranges_to(candidate.current, bundle.rays)
+        ranges = candidate.surface_ranges(bundle)
         error = (bundle.rays[RANGE] - ranges) / sensor.std
         clear = ranges < bundle.rays[OCCLUSION]
         clear &= (bundle.outcomes == MEASURED) & (np.abs(error) < options.max_residual)
@@ -112,9 +126,25 @@ def scan_dispersion(candidates: Sequence[Candidate], sensor: BeamModel) -> float
         count = np.bincount(bundle.scan[clear])
         total = np.bincount(bundle.scan[clear], error[clear])
         many = count >= options.min_rays_of_scan
-        squares += float((total[many] ** 2 / count[many]).sum())
-        scans += int(np.count_nonzero(many))
-    return max(squares / scans, 1.0) if scans >= options.min_rays else 1.0
+        if many.any():
+            found.append(float((total[many] ** 2 / count[many]).mean()))
+            scans.append(int(np.count_nonzero(many)))
+    return max(weighted_median(found, scans), 1.0) if sum(scans) >= options.min_rays else 1.0
+
+
+def weighted_median(values: Sequence[float], weights: Sequence[float]) -> float:
+    """Return the weighted median: the mean of the values around half of the weight.
+
+    Args:
+        values: (N,), one at least.
+        weights: (N,), positive.
+
+    Returns:
+        The median, by linear interpolation between the values at their weights' middles.
+    """
+    order = np.argsort(values)
+    weight = np.asarray(weights, dtype=np.float64)[order]
+    return float(np.interp(weight.sum() / 2, np.cumsum(weight) - weight / 2, np.asarray(values)[order]))
 
 
 def clustered_dispersion(candidates: Sequence[Candidate], sensor: BeamModel) -> float:
@@ -122,7 +152,7 @@ def clustered_dispersion(candidates: Sequence[Candidate], sensor: BeamModel) -> 
 
     The scores (gradients of the log-likelihood by a candidate's parameters) of stretches scatter more than the
     information of their rays says: a sandwich estimate clustered by time (Liang and Zeger 1986), for several lengths,
-    of which the largest significant one counts.
+    of which the largest significant one counts; each the median over the candidates.
 
     Args:
         candidates: The fitted candidates.
@@ -132,12 +162,13 @@ def clustered_dispersion(candidates: Sequence[Candidate], sensor: BeamModel) -> 
         1 or more.
     """
     options = sensor.options
-    bundles = [candidate.rays_with_background(candidates, sensor) for candidate in candidates]
-    pairs = zip(candidates, bundles, strict=True)
+    fitting = _without_outlines(candidates)
+    bundles = [candidate.rays_with_background(candidates, sensor) for candidate in fitting]
+    pairs = zip(fitting, bundles, strict=True)
     scores = [score for pair in pairs if (score := _scan_scores(*pair, sensor)) is not None]
     largest = 1.0
     for length in options.stretches:
-        squares, freedom = 0.0, 0
+        ratios, freedom = [], []
         for score in scores:
             stretches = len(score) // length
             if stretches < options.min_stretches:
@@ -145,9 +176,12 @@ def clustered_dispersion(candidates: Sequence[Candidate], sensor: BeamModel) -> 
             sums = score[: stretches * length].reshape(stretches, length, -1).sum(axis=1)
             sums -= sums.mean(axis=0)
             whole = len(score) / (stretches * length) * stretches**2 / (stretches - 1)
-            squares += float((sums**2).sum()) * whole
-            freedom += sums.size
-        if freedom and (found := squares / freedom) > 1 + options.significance * math.sqrt(2 / freedom):
+            ratios.append(float((sums**2).sum()) * whole / sums.size)
+            freedom.append(sums.size)
+        if not freedom:
+            continue
+        found = weighted_median(ratios, freedom)
+        if found > 1 + options.significance * math.sqrt(2 / sum(freedom)):
             largest = max(largest, found)
     return largest
 
@@ -222,7 +256,7 @@ def maximum_likelihood_noise(
 
 def _met(candidate: Candidate, bundle: RayBundle) -> tuple[FloatArray, NDArray[np.int8], FloatArray]:
     """Return the ranges (m) at which rays meet a candidate, their outcomes, and measured ranges or limits (m)."""
-    ranges = ranges_to(candidate.current, bundle.rays)
+    ranges = candidate.surface_ranges(bundle)
     meets = (ranges < bundle.rays[OCCLUSION]) & (ranges < bundle.max_range)
     return ranges[meets], bundle.outcomes[meets], bundle.rays[RANGE, meets]
 

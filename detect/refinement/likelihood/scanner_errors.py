@@ -70,12 +70,14 @@ class Surroundings:
         log_likelihood: (N,) of the measurements by it (nats).
         primitives: Other candidates, where they are.
         walls: Walls, where the map has them.
+        occlusion: Ranges (N,) in m to further surfaces; FAR for none.
     """
 
     background: Background
     log_likelihood: FloatArray
     primitives: Sequence[Primitive]
     walls: Sequence[Primitive]
+    occlusion: Sequence[FloatArray] = ()
 
 
 def without_errors(
@@ -98,7 +100,7 @@ def without_errors(
     rays[RANGE] -= errors.range_bias
     rays[BACKGROUND] = around.log_likelihood
     walls = _occlusion(rays, around.walls, turns) - errors.range_bias
-    rays[OCCLUSION] = np.minimum(walls, _occlusion(rays, around.primitives, turns))
+    rays[OCCLUSION] = np.minimum.reduce([walls, _occlusion(rays, around.primitives, turns), *around.occlusion])
     behind = around.background.ranges - errors.range_bias
     apply_occlusion(RayData(rays, bundle.outcomes, sensor.std, sensor.table), behind, around.background.blocked)
     if errors.mixed:

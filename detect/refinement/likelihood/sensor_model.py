@@ -190,6 +190,7 @@ def with_background(
     log_likelihood: FloatArray,
     occluders: Sequence[Primitive],
     sensor: BeamModel,
+    occlusion: Sequence[FloatArray] = (),
 ) -> RayBundle:
     """Return rays with what they measure where they miss a primitive.
 
@@ -199,12 +200,13 @@ def with_background(
         log_likelihood: (N,) of :func:`background_log_likelihood`.
         occluders: Other primitives and walls, which may stand before the primitive or the background.
         sensor: The sensor.
+        occlusion: Ranges (N,) in m to further things that may stand there; FAR where a ray misses them.
 
     Returns:
         The rays, the rows OCCLUSION and BACKGROUND set.
     """
     rays = bundle.rays.copy()
-    rays[OCCLUSION] = FAR
+    rays[OCCLUSION] = np.minimum.reduce(occlusion, initial=FAR) if occlusion else FAR
     rays[BACKGROUND] = log_likelihood
     for other in occluders:
         occlude(OUTLINES, NUMBERS[other.kind], parameters_of(other), other.bounding_radius, rays)

@@ -116,6 +116,18 @@ class MapCells:
         at_rows, at_cols = np.nonzero(self.large[rows, cols] & is_within(primitive, points, margin))
         return at_rows + rows.start, at_cols + cols.start
 
+    def around(self, primitive: Primitive, reach: float) -> tuple[slice, slice, FloatArray]:
+        """Find the cells around a primitive.
+
+        Args:
+            primitive: The primitive.
+            reach: How far from its centroid (m) along both axes.
+
+        Returns:
+            Rows, columns, and the cells' centres (rows, cols, 2) in m.
+        """
+        return _cells_around(self.frame, primitive, reach)
+
     def is_behind_wall(self, primitive: Primitive) -> bool:
         """Tell whether a primitive reaches behind a wall that is free on one side only."""
         outline, penetration = primitive.outline(OUTLINE_POINTS), self.options.penetration

@@ -1,0 +1,158 @@
+"""None of the kinds: what else may explain a candidate's rays, and how likely that is.
+
+Three hypotheses compete with the kinds for the same rays: a deformed primitive and a free polygon
+(detect.refinement.outlines), which are shapes of their own, and a part of something larger, which goes on in the map.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import shapely
+
+from detect.refinement.candidates import Candidate
+from detect.refinement.fitting.evidence import laplace_evidence
+from detect.refinement.fitting.fit import KindFit
+from detect.refinement.likelihood.geometry import primitive_of
+from detect.refinement.likelihood.rays import RayBundle
+from detect.refinement.likelihood.sensor_model import BeamModel
+from detect.refinement.options import DEFAULTS, OtherOptions
+from detect.refinement.outlines.contact import contact_of
+from detect.refinement.outlines.free_outline import OutlineCost, StarOutline, fit_free_outline, score_test
+from detect.refinement.outlines.polygons import contour_of, fit_polygons, polygon_starts
+from prim.arrays import FloatArray
+from prim.metrics import outline_iou
+from prim.shapes import Kind, Primitive
+
+
+@dataclass(frozen=True)
+class Alternative:
+    """A hypothesis beside the kinds.
+
+    Attributes:
+        vertices: (V, 2) its outline in m, map frame.
+        log_odds: Log Bayes factor against the likeliest kind (nats).
+        std: Standard deviation (m) of the outline, across it; the median over its vertices.
+        reason: What it is, in words and numbers.
+    """
+
+    vertices: FloatArray
+    log_odds: float
+    std: float
+    reason: str
+
+
+def free_alternatives(
+    candidate: Candidate, bundle: RayBundle, candidates: Sequence[Candidate], sensor: BeamModel
+) -> list[Alternative]:
+    """Fit outlines of no kind to a candidate's rays.
+
+    Args:
+        candidate: The fitted candidate.
+        bundle: Its rays with their background.
+        candidates: All candidates.
+        sensor: The sensor.
+
+    Returns:
+        Those that differ from the likeliest kind's outline.
+    """
+    evidence = {
+        fit.kind: laplace_evidence(fit, sensor.dispersion, candidate.options.evidence) for fit in candidate.fits
+    }
+    best = max(candidate.fits, key=lambda fit: evidence[fit.kind])
+    found = [
+        _deformed(candidate, best, bundle, sensor),
+        _polygon(candidate, evidence[best.kind], bundle, candidates, sensor),
+    ]
+    kind = primitive_of(best.kind, best.p)
+    limit = 1 - candidate.options.other.min_difference
+    return [one for one in found if one is not None and outline_iou(one.vertices, kind.outline()) < limit]
+
+
+def _deformed(candidate: Candidate, best: KindFit, bundle: RayBundle, sensor: BeamModel) -> Alternative | None:
+    """Fit the deformed outline of the best kind; None where the score test promises too little."""
+    options, other = candidate.options.outline, candidate.options.other
+    blur = max(sensor.footprint, options.least_blur)
+    star = StarOutline.of(primitive_of(best.kind, best.p), options)
+    cost = OutlineCost(star, bundle, sensor, options)
+    if score_test(cost, max(options.test_blur, blur), options)[1] < other.min_gain:
+        return None
+    fit = fit_free_outline(cost, blur, options)
+    reason = f"a free outline explains its rays better by {fit.log_bayes_factor:.0f} nats"
+    return Alternative(star.deformed(fit.coefficients, options), fit.log_bayes_factor, fit.std, reason)
+
+
+def _polygon(
+    candidate: Candidate, evidence: float, bundle: RayBundle, candidates: Sequence[Candidate], sensor: BeamModel
+) -> Alternative | None:
+    """Fit polygons; None where there is nothing to begin with."""
+    options = candidate.options.polygon
+    others = [other.current for other in candidates if other is not candidate]
+    starts = polygon_starts([primitive_of(fit.kind, fit.p) for fit in candidate.fits], options)
+    contour = contour_of(candidate.current, candidate.cells, others, candidate.walls, options)
+    if contour is not None:
+        starts.append(contour)
+    if not starts:
+        return None
+    fit = fit_polygons(starts, bundle, sensor, options)
+    log_odds = fit.log_evidence - evidence - candidate.options.other.polygon_handicap
+    reason = f"a polygon of {len(fit.vertices)} vertices explains its rays better by {log_odds:.0f} nats"
+    return Alternative(fit.vertices, log_odds, fit.std, reason)
+
+
+def larger_alternative(
+    candidate: Candidate, primitive: Primitive, others: Sequence[Primitive], sensor: BeamModel
+) -> Alternative | None:
+    """Ask whether a candidate is a part of something larger.
+
+    Args:
+        candidate: The fitted candidate.
+        primitive: What it is told as.
+        others: The other primitives that are told.
+        sensor: The sensor.
+
+    Returns:
+        The hypothesis; None where nothing unexplained touches the candidate.
+    """
+    options = candidate.options.contact
+    contact = contact_of(primitive, candidate.bundle, candidate.cells, others, candidate.walls, sensor, options)
+    if not contact.cells:
+        return None
+    reason = (
+        f"it is a part of something larger: its rays are likelier by {contact.nats:.0f} nats with what touches it"
+    )
+    return Alternative(primitive.outline(), contact.nats - options.min_nats, 0.0, reason)
+
+
+def other_log_odds(
+    alternatives: Sequence[Alternative], likeliest_kind: float, options: OtherOptions = DEFAULTS.other
+) -> float:
+    """Return the log posterior odds of «none of the kinds».
+
+    Args:
+        alternatives: The hypotheses, each with its odds against the likeliest kind.
+        likeliest_kind: Posterior probability of that kind among the kinds.
+        options: The prior.
+
+    Returns:
+        Nats; -inf where there is no alternative.
+    """
+    if not alternatives:
+        return -math.inf
+    # kinds share their prior evenly: their evidence is the likeliest one's, over its probability, over their number
+    prior = math.log(options.prior / (1 - options.prior))
+    together = float(np.logaddexp.reduce([one.log_odds for one in alternatives]))
+    return prior + together + math.log(max(likeliest_kind, 1 / len(Kind)) * len(Kind))
+
+
+def simple_outline(vertices: FloatArray) -> FloatArray:
+    """Return a closed outline (V, 2) that does not cross itself: the largest part where it does."""
+    polygon = shapely.Polygon(vertices)
+    if polygon.is_valid:
+        return vertices
+    parts = shapely.get_parts(shapely.make_valid(polygon))
+    areas = [part.area for part in parts]
+    return np.asarray(shapely.get_coordinates(shapely.get_exterior_ring(parts[int(np.argmax(areas))]))[:-1])
