@@ -168,7 +168,7 @@ class ErrorSearch:
         likeliest = self.with_best_bias(sensor, replace(known, reach=0.0), fits)
         if is_wide:
             footprint = 0.0 if known.reach else min(sensor.footprint, options.first_footprint)
-            likeliest = self._with_width(replace(sensor, footprint=footprint), likeliest)
+            likeliest = self._with_width(sensor, replace(sensor, footprint=footprint), likeliest)
         errors = likeliest.errors
         std = common_step(likeliest, sensor, options)[1]
         is_biased = abs(errors.range_bias) >= max(options.min_bias, options.deviations * std)
@@ -229,14 +229,17 @@ class ErrorSearch:
             profile = self.at(sensor, replace(profile.errors, range_bias=bias), profile.fits)
         return profile
 
-    def _with_width(self, sensor: BeamModel, start: Profile) -> Profile:
-        """Return the likeliest profile with beams of a width; the one to start with where none gains enough."""
+    def _with_width(self, sensor: BeamModel, sharp: BeamModel, start: Profile) -> Profile:
+        """Return the likeliest profile with beams of a width; the one to start with where none gains enough.
+
+        A narrow one is tried first, with the sensor as it is; what is searched for is with a ``sharp`` one.
+        """
         options = self.options
         for reach in options.reaches:
             first = self.at(sensor, replace(start.errors, reach=reach), start.fits)
             gains = [a.cost - b.cost for a, b in zip(start.expansions, first.expansions, strict=True)]
             if float(np.median(gains)) > 0:
-                wide = self._with_best_reach(sensor, start)
+                wide = self._with_best_reach(sharp, start)
                 enough = options.min_gain * len(self.trusted) * sensor.dispersion
                 return wide if start.cost - wide.cost > enough else start
             if reach >= options.first_reach:
