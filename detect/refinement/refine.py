@@ -27,6 +27,7 @@ from detect.refinement.fitting.evidence import compare_kinds
 from detect.refinement.likelihood.geometry import parameters_of, ranges_to
 from detect.refinement.likelihood.kernels import BACKGROUND, OCCLUSION
 from detect.refinement.likelihood.rays import RayBundle, collect_rays
+from detect.refinement.likelihood.scanner_errors import NO_ERRORS
 from detect.refinement.likelihood.sensor_model import Background, BeamModel, DistanceMap, surface_likelihood
 from detect.refinement.misfits import sensor_without_misfits
 from detect.refinement.options import DEFAULTS, AcceptanceOptions, OtherOptions, RefinementOptions
@@ -429,11 +430,7 @@ class Refinement:
         noise = known_noise or estimate_noise(single, sensor)
         sensor = BeamModel.create(noise, span, max_std=max_noise, options=options.sensor)
         self._fit_jointly(pool, single, sensor)
-        sensor = correct_scanner_errors(pool, single, sensor, known_noise)
-        if not options.closed_world:
-            sensor = sensor_without_misfits(pool, single, sensor, known_noise)
-        sensor, self.sensor = settle_scanner_errors(pool, single, sensor, known_noise)
-        sensor = estimate_sensor(single, sensor, known_noise)
+        sensor = self._find_sensor(pool, single, sensor, known_noise)
         disperses = sensor.dispersion > options.sensor.significant_dispersion
         fit_candidates(pool, single, [disperses] * len(single), sensor)
         self.noise_std = sensor.std
@@ -441,6 +438,19 @@ class Refinement:
         finished = pool.map(lambda item: finish(item, whole_map.background(item.bundle), sensor), single)
         results = {id(candidate): result for candidate, result in zip(single, finished, strict=True)}
         return results if options.closed_world else self._beside_others(pool, single, results, sensor)
+
+    def _find_sensor(
+        self, pool: Executor, candidates: list[Candidate], sensor: BeamModel, noise_std: float | None
+    ) -> BeamModel:
+        """Estimate the sensor by the candidates that a kind fits, once its errors are taken out of all rays."""
+        sensor = correct_scanner_errors(pool, candidates, sensor, noise_std)
+        is_corrected = candidates[0].errors != NO_ERRORS
+        if not self.options.closed_world:
+            sensor = sensor_without_misfits(pool, candidates, sensor, noise_std)
+        sensor, self.sensor = settle_scanner_errors(pool, candidates, sensor, noise_std)
+        if is_corrected and self.sensor is None and not self.options.closed_world:
+            sensor = sensor_without_misfits(pool, candidates, sensor, noise_std)  # with all errors back
+        return estimate_sensor(candidates, sensor, noise_std)
 
     def _beside_others(
         self,

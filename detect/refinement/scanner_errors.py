@@ -109,6 +109,8 @@ def settle_scanner_errors(
 ) -> tuple[BeamModel, SensorErrors | None]:
     """Find the scanner's errors again by the candidates that a kind fits now, and what is unsure because of them.
 
+    Where no kind fits any of them, nothing shows errors of the scanner: all are put back.
+
     Args:
         pool: The threads.
         candidates: The candidates, fitted without the errors that were found first; they are fitted again.
@@ -122,14 +124,17 @@ def settle_scanner_errors(
     if errors == NO_ERRORS:
         return sensor, None
     trusted = [candidate for candidate in candidates if candidate.outline is None]
-    search = ErrorSearch(pool, candidates, trusted or candidates, candidates[0].options.scanner)
+    search = ErrorSearch(pool, candidates, trusted, candidates[0].options.scanner)
     estimated = estimate_sensor(candidates, sensor, noise_std)
-    if errors.range_bias or errors.reach:
+    if not trusted:
+        errors = NO_ERRORS
+    elif errors.range_bias or errors.reach:
         errors = search.likeliest(estimated, errors)
-    estimated = search.take_out(errors, estimated, noise_std, search_kinds=False)
+    estimated = search.take_out(errors, estimated, noise_std, search_kinds=errors == NO_ERRORS)
+    if errors == NO_ERRORS:
+        return estimated, None
     std = search.add_shared_errors(estimated, errors)
-    found = SensorErrors(errors.range_bias, std, 2 * errors.reach, 2 * errors.mixed)
-    return estimated, found if errors != NO_ERRORS else None
+    return estimated, SensorErrors(errors.range_bias, std, 2 * errors.reach, 2 * errors.mixed)
 
 
 @dataclass(frozen=True)
