@@ -123,6 +123,20 @@ def test_a_wide_beam_meets_what_any_part_of_it_meets() -> None:
     assert (ranges_to(circle, turned) < FAR).tolist() == [True, True, False, True, False]
 
 
+def test_near_a_silhouette_a_wide_beam_is_turned_inwards_and_reads_what_is_nearest() -> None:
+    """The near end of a plate that is seen at a slant is its silhouette."""
+    plate, rays = Primitive(Kind.RECTANGLE, 0.0, 0.0, math.pi / 4, (0.4, 0.02)), rays_along_x(-0.135)
+    background = Background(np.full(1, 2.5), np.ones(1, np.bool_), np.zeros(1, np.bool_), 0.005)
+    around, sensor = Surroundings(background, np.full(1, -1.5), (), ()), BeamModel.create(NOISE, 5.0)
+    turned = without_errors(bundle_of(rays), around, plate, sensor, ScannerErrors(reach=0.01)).rays
+    parts = rays_along_x(*np.full(201, -0.135))
+    parts[2], parts[3] = np.cos(turns := np.linspace(-0.01, 0.01, 201)), np.sin(turns)
+    nearest = ranges_to(plate, parts).min()
+    assert turned[3, 0] == pytest.approx(math.sin(0.01))
+    residual = turned[RANGE, 0] - ranges_to(plate, turned)[0]
+    assert residual == pytest.approx(rays[RANGE, 0] - nearest, abs=1e-3)
+
+
 def test_only_readings_between_two_surfaces_at_a_silhouette_are_left_out() -> None:
     rays = rays_along_x(0.1, 0.1, 0.1, 0.0)
     rays[RANGE] = (1.5, 0.97, 2.5, 1.5)
