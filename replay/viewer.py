@@ -41,6 +41,7 @@ from replay.viewer_layout import (
 )
 from replay.viewing.checks import check_display, check_viewer, local_address
 from replay.viewing.drawing import (
+    closed,
     confidence_ellipse,
     crop_sheet,
     occupancy_percent,
@@ -81,7 +82,7 @@ LASER_LENGTH, MAX_SCALE = 0.06, 10.0
 SCAN_COLOR = (255, 80, 60)
 TRAJECTORY_COLOR = (40, 110, 220)
 LASER_COLOR = (40, 110, 220)
-TRUTH_COLOR = (150, 150, 150)
+TRUTH_COLOR, TRUTH_OTHERS_COLOR = (150, 150, 150), (200, 200, 200)
 LABEL_COLOR = (255, 255, 255)
 
 BOUNDS_ALPHA = 130
@@ -175,6 +176,17 @@ class RerunViewer:
         if world.walls:
             strips = list(self._raised(np.asarray(world.walls).reshape(-1, 2, 2), TRUTH_HEIGHT))
             self._recording.log(f"{SCENE}/truth/walls", rr.LineStrips3D(strips, colors=[TRUTH_COLOR], radii=radius))
+        if world.solids:
+            self._recording.log(
+                f"{SCENE}/truth/others",
+                rr.LineStrips3D(
+                    [self._raised(closed(solid.outline), TRUTH_HEIGHT) for solid in world.solids],
+                    labels=[printable(solid.name) for solid in world.solids],
+                    show_labels=False,
+                    colors=[TRUTH_OTHERS_COLOR],
+                    radii=radius,
+                ),
+            )
 
     def show_scan(self, posed: PosedScan) -> None:
         """See :meth:`.Viewer.show_scan`."""

@@ -187,13 +187,13 @@ def _fit_candidate(candidate: Candidate, bundle: RayBundle, search: bool, sensor
     else:
         fits = refit(candidate.fits, bundle, sensor, options.fit)
     possible = [fit for fit in fits if candidate.is_possible(primitive_of(fit.kind, fit.p))]
-    evidence = {fit.kind: laplace_evidence(fit, options=options.evidence) for fit in possible or fits}
+    rated = [(laplace_evidence(fit, options=options.evidence), fit) for fit in possible or fits]
     # the dispersion is left out here, and multiplies the limit: only the Occam factors differ from dividing by it
-    ordered = sorted(possible or fits, key=lambda fit: -evidence[fit.kind])
-    limit = evidence[ordered[0].kind] - options.evidence.log_evidence_margin * sensor.dispersion
-    likely = {kind for kind, value in evidence.items() if value > limit}
+    rated.sort(key=lambda item: -item[0])
+    limit = rated[0][0] - options.evidence.log_evidence_margin * sensor.dispersion
+    likely = {fit.kind for evidence, fit in rated if evidence > limit}
     likely |= {SPECIAL_CASES[kind] for kind in likely if kind in SPECIAL_CASES}
-    candidate.set_fits([fit for fit in ordered if fit.kind in likely], bundle, sensor)
+    candidate.set_fits([fit for _, fit in rated if fit.kind in likely], bundle, sensor)
 
 
 def _is_unchanged(

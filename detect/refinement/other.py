@@ -20,7 +20,7 @@ from detect.refinement.likelihood.geometry import primitive_of
 from detect.refinement.likelihood.rays import RayBundle
 from detect.refinement.likelihood.sensor_model import BeamModel
 from detect.refinement.options import DEFAULTS, OtherOptions
-from detect.refinement.outlines.contact import contact_of
+from detect.refinement.outlines.contact import contact_of, is_flush
 from detect.refinement.outlines.free_outline import OutlineCost, StarOutline, fit_free_outline, score_test
 from detect.refinement.outlines.polygons import contour_of, fit_polygons, polygon_starts
 from prim.arrays import FloatArray
@@ -37,12 +37,15 @@ class Alternative:
         log_odds: Log Bayes factor against the likeliest kind (nats).
         std: Standard deviation (m) of the outline, across it; the median over its vertices.
         reason: What it is, in words and numbers.
+        is_told: Whether a candidate that it is likelier for than the kinds is told as it; else the kind is told, with
+            the probability that is left.
     """
 
     vertices: FloatArray
     log_odds: float
     std: float
     reason: str
+    is_told: bool = True
 
 
 def free_alternatives(
@@ -59,13 +62,11 @@ def free_alternatives(
     Returns:
         Those that differ from the likeliest kind's outline.
     """
-    evidence = {
-        fit.kind: laplace_evidence(fit, sensor.dispersion, candidate.options.evidence) for fit in candidate.fits
-    }
-    best = max(candidate.fits, key=lambda fit: evidence[fit.kind])
+    rated = [(laplace_evidence(fit, sensor.dispersion, candidate.options.evidence), fit) for fit in candidate.fits]
+    evidence, best = max(rated, key=lambda item: item[0])
     found = [
         _deformed(candidate, best, bundle, sensor),
-        _polygon(candidate, evidence[best.kind], bundle, candidates, sensor),
+        _polygon(candidate, evidence, bundle, candidates, sensor),
     ]
     kind = primitive_of(best.kind, best.p)
     limit = 1 - candidate.options.other.min_difference
@@ -91,7 +92,8 @@ def _polygon(
     """Fit polygons; None where there is nothing to begin with."""
     options = candidate.options.polygon
     others = [other.current for other in candidates if other is not candidate]
-    starts = polygon_starts([primitive_of(fit.kind, fit.p) for fit in candidate.fits], options)
+    likeliest = {fit.kind: fit for fit in reversed(candidate.fits)}
+    starts = polygon_starts([primitive_of(fit.kind, fit.p) for fit in likeliest.values()], options)
     contour = contour_of(candidate.current, candidate.cells, others, candidate.walls, options)
     if contour is not None:
         starts.append(contour)
@@ -103,9 +105,9 @@ def _polygon(
     return Alternative(fit.vertices, log_odds, fit.std, reason)
 
 
-def larger_alternative(
+def larger_alternatives(
     candidate: Candidate, primitive: Primitive, others: Sequence[Primitive], sensor: BeamModel
-) -> Alternative | None:
+) -> list[Alternative]:
     """Ask whether a candidate is a part of something larger.
 
     Args:
@@ -115,16 +117,22 @@ def larger_alternative(
         sensor: The sensor.
 
     Returns:
-        The hypothesis; None where nothing unexplained touches the candidate.
+        The hypotheses; none where nothing unexplained touches the candidate, and no side of it is flush with what is
+        beside it.
     """
-    options = candidate.options.contact
-    contact = contact_of(primitive, candidate.bundle, candidate.cells, others, candidate.walls, sensor, options)
-    if not contact.cells:
-        return None
-    reason = (
-        f"it is a part of something larger: its rays are likelier by {contact.nats:.0f} nats with what touches it"
+    options = candidate.options
+    outline, found = primitive.outline(), []
+    contact = contact_of(
+        primitive, candidate.bundle, candidate.cells, others, candidate.walls, sensor, options.contact
     )
-    return Alternative(primitive.outline(), contact.nats - options.min_nats, 0.0, reason)
+    if contact.cells:
+        nats = contact.nats
+        reason = f"a part of something larger: its rays are likelier by {nats:.0f} nats with what touches it"
+        found.append(Alternative(outline, nats - options.contact.min_nats, 0.0, reason))
+    if is_flush(primitive, candidate.cells, others, options.contact):
+        reason = "one side is flush with what is beside it: as likely a part of that"
+        found.append(Alternative(outline, math.log(options.other.flush / len(Kind)), 0.0, reason, is_told=False))
+    return found
 
 
 def other_log_odds(

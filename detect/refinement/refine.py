@@ -34,7 +34,7 @@ from detect.refinement.options import DEFAULTS, AcceptanceOptions, OtherOptions,
 from detect.refinement.other import (
     Alternative,
     free_alternatives,
-    larger_alternative,
+    larger_alternatives,
     other_log_odds,
     simple_outline,
 )
@@ -48,9 +48,6 @@ from prim.metrics import overlap_coefficient
 from prim.scan import Scan
 from prim.se2 import Pose2D
 from prim.shapes import Kind, Primitive
-
-MAX_LOG_ODDS = 700.0
-"""Nats beyond which odds are as good as none: the exponential is finite."""
 
 
 @dataclass(frozen=True)
@@ -90,7 +87,7 @@ class RefinedPrimitive:
     @property
     def is_other(self) -> bool:
         """Whether it is likelier none of the kinds than one of them."""
-        return self.alternative is not None and self.other_probability > 0.5
+        return self.alternative is not None and self.alternative.is_told and self.other_probability > 0.5
 
     def beside(self, alternatives: Sequence[Alternative], options: OtherOptions) -> RefinedPrimitive:
         """Hold the kinds against alternatives.
@@ -105,7 +102,7 @@ class RefinedPrimitive:
         if not alternatives:
             return self
         likeliest = self.kind_probabilities[self.primitive.kind]
-        probability = 1 / (1 + math.exp(-max(other_log_odds(alternatives, likeliest, options), -MAX_LOG_ODDS)))
+        probability = float(np.exp(-np.logaddexp(0.0, -other_log_odds(alternatives, likeliest, options))))
         best = max(alternatives, key=lambda one: one.log_odds)
         return replace(self, other_probability=probability, alternative=best)
 
@@ -472,13 +469,12 @@ class Refinement:
         }
         rest = [one for one in asked if id(one) in kept]
 
-        def larger(one: Candidate) -> Alternative | None:
+        def larger(one: Candidate) -> list[Alternative]:
             others = [primitive for key, primitive in kept.items() if key != id(one)]
-            return larger_alternative(one, kept[id(one)], others, sensor)
+            return larger_alternatives(one, kept[id(one)], others, sensor)
 
-        for one, alternative in zip(rest, pool.map(larger, rest), strict=True):
-            if alternative is not None:
-                beside[id(one)] = _required(results[id(one)]).beside([*shapes[id(one)], alternative], other)
+        for one, parts in zip(rest, pool.map(larger, rest), strict=True):
+            beside[id(one)] = _required(results[id(one)]).beside([*shapes[id(one)], *parts], other)
         return beside
 
     def _near_rays(self, candidates: list[Candidate]) -> list[Candidate]:

@@ -85,6 +85,54 @@ def contact_of(
     return Contact((with_cells - without_cells) / sensor.dispersion, len(touching[0]))
 
 
+def is_flush(
+    primitive: Primitive, cells: MapCells, others: Sequence[Primitive], options: ContactOptions = DEFAULTS.contact
+) -> bool:
+    """Tell whether one side of a primitive is flush with a wall or with another thing: no ray saw what is between.
+
+    Args:
+        primitive: The primitive.
+        cells: The map.
+        others: The other primitives.
+        options: Numeric parameters.
+
+    Returns:
+        Whether one is; never of round ones.
+    """
+    if primitive.is_round:
+        return False
+    corners = primitive.outline()
+    return any(
+        _is_side_flush(corner, following, cells, others, options)
+        for corner, following in zip(corners, np.roll(corners, -1, axis=0), strict=True)
+    )
+
+
+def _is_side_flush(
+    first: FloatArray, last: FloatArray, cells: MapCells, others: Sequence[Primitive], options: ContactOptions
+) -> bool:
+    """Tell whether nowhere along a side, its ends left out, a free cell is beside it, but other things' cells are."""
+    frame, resolution = cells.frame, cells.frame.resolution
+    length = float(np.hypot(*(last - first)))
+    along = (last - first) / length
+    places = np.arange(options.side_ends * resolution, length - options.side_ends * resolution, resolution)
+    if len(places) < options.side_cells:
+        return False
+    away = np.array([along[1], -along[0]])
+    depths = np.array(options.side_strip) * resolution
+    points = first + places[:, None, None] * along + depths[:, None] * away
+    col, row = np.moveaxis(np.floor(points / resolution).astype(int) - [frame.col, frame.row], -1, 0)
+    inside = (row >= 0) & (row < frame.rows) & (col >= 0) & (col < frame.cols)
+    row, col = np.clip(row, 0, frame.rows - 1), np.clip(col, 0, frame.cols - 1)
+    free, taken = cells.free[row, col] & inside, cells.large[row, col] & inside
+    for wall in cells.walls:
+        taken |= wall.contains(points, options.flush_wall * resolution, 0.0)
+    for other in others:
+        taken |= is_within(other, points, options.own)
+    unseen, beside = ~free.any(axis=1), taken.any(axis=1)
+    return bool(unseen.mean() > options.flush_share and beside.mean() > options.flush_share)
+
+
 def centres_within(a: Primitive, b: Primitive, reach: float) -> bool:
     """Tell whether two primitives' centroids are no further apart than ``reach`` (m).
 
@@ -155,6 +203,11 @@ def _touching_cells(
         nx, ny, d = wall.line
         width = max(options.wall_width, options.wall_width_cells * resolution)
         unexplained &= np.abs(points @ np.array([nx, ny]) - d) >= width
+    outline, depth = primitive.outline(OUTLINE_POINTS), max(options.wall_depth, options.wall_depth_cells * resolution)
+    width = max(options.wall_width, options.wall_width_cells * resolution)
+    for straight in cells.walls:
+        if not straight.hides(outline, depth, 0.0):
+            unexplained &= ~straight.contains(points, width, options.wall_extension)
     at_edge, touch, inside = (
         is_within(primitive, points, margin)
         for margin in (options.edge * resolution, options.touch * resolution, 0.0)

@@ -37,6 +37,23 @@ class OneSidedWall:
     last: float
     depth: float
 
+    def contains(self, points: FloatArray, width: float, extension: float) -> NDArray[np.bool_]:
+        """Tell which points are the wall's: at its line, or behind it as far as it reaches.
+
+        Args:
+            points: (..., 2) in metres, map frame.
+            width: How near (m) to its line, on the free side.
+            extension: How far (m) it goes on beyond its ends.
+
+        Returns:
+            (...) bool.
+        """
+        nx, ny, d = self.line
+        along = points @ np.array([-ny, nx])
+        off = points @ np.array([nx, ny]) - d
+        beside = (along > self.first - extension) & (along < self.last + extension)
+        return np.asarray((off < width) & (off > -max(width, self.depth)) & beside)
+
     def hides(self, points: FloatArray, penetration: float, extension: float) -> bool:
         """Tell whether some points lie behind the wall.
 
@@ -146,6 +163,9 @@ class MapCells:
     def without(self, primitives: Sequence[Primitive], margin: float) -> NDArray[np.bool_]:
         """Return the occupied cells (rows, cols) but for those of primitives.
 
+        Noise blurs a primitive into cells around it: those that are connected with its own, and belong to nothing
+        larger, are its own too.
+
         Args:
             primitives: The primitives.
             margin: Cells this near (m) are a primitive's; of walls' cells, those that all but touch it.
@@ -159,7 +179,16 @@ class MapCells:
             rows, cols, points = _cells_around(self.frame, primitive, primitive.bounding_radius + margin)
             near, touching = (is_within(primitive, points, reach) for reach in (margin, touch))
             occupied[rows, cols] &= ~np.where(self.large[rows, cols], touching, near)
+            self._remove_connected(occupied, primitive, margin)
         return occupied
+
+    def _remove_connected(self, occupied: BoolGrid, primitive: Primitive, margin: float) -> None:
+        """Remove the cells from ``occupied`` that are connected with a primitive's, and no further than its blur."""
+        reach = primitive.bounding_radius + self.options.blur
+        rows, cols, points = _cells_around(self.frame, primitive, reach)
+        labels, small = self.labels[rows, cols], ~self.large[rows, cols]
+        own = np.unique(labels[is_within(primitive, points, margin) & small & (labels > 0)])
+        occupied[rows, cols] &= ~(np.isin(labels, own) & small & is_within(primitive, points, self.options.blur))
 
 
 def _cells_around(frame: GridFrame, primitive: Primitive, reach: float) -> tuple[slice, slice, FloatArray]:
@@ -191,9 +220,10 @@ def _straight_walls(
     for line, on_it in _wall_lines(surface, resolution, options, lines):
         nx, ny, d = line
         off, along = points @ np.array([nx, ny]) - d, points @ np.array([-ny, nx])
-        thin, deep = options.wall_cells * resolution, options.wall_depth
         side = _free_side(line, on_it, free, resolution, options)
         first, last = _ends(on_it, line)
+        thin = options.wall_cells * resolution
+        deep = _depth_behind(line, side, (first, last), free, resolution, options)
         beside = (along > first - thin) & (along < last + thin)
         near |= beside & (off > (-deep if side > 0 else -thin)) & (off < (deep if side < 0 else thin))
         if side:
@@ -242,6 +272,25 @@ def _free_side(line: Line, on_it: FloatArray, free: FloatArray, resolution: floa
     if below < options.one_sided * above:
         return 1.0
     return -1.0 if above < options.one_sided * below else 0.0
+
+
+def _depth_behind(
+    line: Line, side: float, ends: tuple[float, float], free: FloatArray, resolution: float, options: MapOptions
+) -> float:
+    """Return how far (m) a wall reaches to the side that is not free: a thick wall ends where the map is free again.
+
+    Where its line goes on through a doorway, what is free there says nothing.
+    """
+    normal = np.array(line[:2])
+    behind, at = -side * (free @ normal - line[2]), free @ np.array([-normal[1], normal[0]])
+    beside = (behind > 0) & (behind < options.wall_depth) & (at > ends[0]) & (at < ends[1])
+    bins, number = np.unique(np.floor(at[beside] / resolution), return_inverse=True)
+    nearest = np.full(len(bins), math.inf)
+    np.minimum.at(nearest, number, behind[beside])
+    nearest = nearest[nearest > options.wall_cells * resolution]
+    if len(nearest) < options.one_sided * (ends[1] - ends[0]) / resolution:
+        return options.wall_depth
+    return max(float(np.median(nearest)) - resolution, options.wall_cells * resolution)
 
 
 def is_within(primitive: Primitive, points: NDArray[np.floating], margin: float) -> NDArray[np.bool_]:
