@@ -84,7 +84,7 @@ ENDS = {
     ("replay/detection", "detect/refinement/surroundings"): {"map_cells"},
     ("replay", "detect/refinement/surroundings"): {"map_cells"},
     ("replay/viewing", "replay"): {"result"},
-    ("replay/viewing", "replay/outputs"): {"report"},
+    ("replay/viewing", "replay/outputs"): {"report", "found_objects"},
     ("replay/scans", "replay"): {"notes", "timing"},
     ("replay/viewing", "replay/detection"): {"stage"},
     ("replay/mapping", "replay"): {"options", "timing"},

@@ -157,6 +157,7 @@ def test_hexagons_are_recorded_mapped_detected_drawn_and_scored(last_row: str, t
         "triangle",
         "ellipse",
         "hexagon",
+        "other",
     }
     drawn = [str(chunk.entity_path) for chunk in RrdReader(tmp_path / "six.forward.rrd").stream()]
     assert any("detections" in path for path in drawn)

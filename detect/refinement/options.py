@@ -350,6 +350,28 @@ class WallOptions:
 
 
 @dataclass(frozen=True)
+class SurfaceOptions:
+    """Straight walls measured by rays."""
+
+    width: float = 3.5
+    """cells; cells this near to a wall's line are the wall's: its line is known no better by them."""
+    min_incidence: float = 0.2
+    """Cosine; rays more oblique than this do not say where a wall is."""
+    min_rays: int = 50
+    """Fewer rays measure no wall."""
+    clear: float = 0.03
+    """m; rays that pass a candidate nearer than this may have met it."""
+    iterations: int = 5
+    """Of the robust regression,"""
+    huber: float = 1.345
+    """standard deviations from which on its residuals count less (95 % efficiency; Huber 1964)."""
+    slope_precision: float = 100.0
+    """A wall's direction by its cells is not changed where few rays say so: weight of a slope of 0."""
+    uncertainty: float = 0.002
+    """m; of a measured wall: none is straight to less."""
+
+
+@dataclass(frozen=True)
 class ProposalOptions:
     """Candidates from the map that the networks did not find."""
 
@@ -573,6 +595,7 @@ class RefinementOptions:
     map: MapOptions = field(default_factory=MapOptions)
     lines: LineOptions = field(default_factory=LineOptions)
     walls: WallOptions = field(default_factory=WallOptions)
+    surfaces: SurfaceOptions = field(default_factory=SurfaceOptions)
     proposals: ProposalOptions = field(default_factory=ProposalOptions)
     acceptance: AcceptanceOptions = field(default_factory=AcceptanceOptions)
     outline: OutlineOptions = field(default_factory=OutlineOptions)

@@ -589,7 +589,7 @@ def _compare_with_map(
     if not meets.any():
         return 0.0, 0, 0.0
     met, cells = bundle.select(meets), map_alone.select(meets)
-    own = np.log(surface_likelihood(met, ranges[meets], np.ones(len(met), np.bool_), 0.0, sensor))
+    own = np.log(surface_likelihood(met, ranges[meets], np.ones(len(met), np.bool_), np.zeros(len(met)), sensor))
     free = np.log(surface_likelihood(met, cells.ranges, cells.hits_map, cells.uncertainty, sensor))
     x, y = met.rays[:2] + ranges[meets] * met.rays[2:4] - [[primitive.x], [primitive.y]]
     sector = np.floor(np.arctan2(y, x) / (2 * math.pi) * sectors).astype(int) % sectors

@@ -123,7 +123,7 @@ def _harmonics(turn: FloatArray, count: int) -> FloatArray:
 
 @lru_cache(maxsize=8)
 def prior_precision(amplitude: float, harmonics: int, decay: float) -> FloatArray:
-    """Compute the prior's precision; of harmonic k the variance is amplitude² k^(-2 decay), of the constant amplitude².
+    """Compute the prior's precision: harmonic k has the variance amplitude² k^(-2 decay), the constant amplitude².
 
     Args:
         amplitude: The standard deviation of the first harmonic's.
