@@ -245,8 +245,9 @@ class ErrorSearch:
             gains = [a.cost - b.cost for a, b in zip(start.expansions, first.expansions, strict=True)]
             if float(np.median(gains)) > 0:
                 wide = self._with_best_reach(sharp, start)
+                narrow = min(start.cost, self.at(sharp, start.errors, start.fits).cost)
                 enough = options.min_gain * len(self.trusted) * sensor.dispersion
-                return wide if start.cost - wide.cost > enough else start
+                return wide if narrow - min(wide.cost, first.cost) > enough else start
             if reach >= options.first_reach:
                 break
         return start
