@@ -15,6 +15,12 @@ from detect.refinement.fitting.evidence import laplace_evidence, max_size
 from detect.refinement.fitting.fit import SPECIAL_CASES, KindFit, fit_all_kinds, refit, refit_same_kind
 from detect.refinement.likelihood.geometry import JACOBIANS, parameters_of, primitive_of, ranges_to
 from detect.refinement.likelihood.rays import RayBundle
+from detect.refinement.likelihood.scanner_errors import (
+    NO_ERRORS,
+    ScannerErrors,
+    Surroundings,
+    without_errors,
+)
 from detect.refinement.likelihood.sensor_model import (
     Background,
     BeamModel,
@@ -46,6 +52,9 @@ class Candidate:
         fits: The fits, likeliest kind first.
         fitted_to: The sensor and the rays, with their background, of these fits.
         is_rough: Whether they were made to some of the rays only.
+        errors: Errors of the scanner, which are taken out of its rays.
+        shared_errors: (5, E) by how much its parameters change with one standard deviation of each error of the
+            scanner; None for none.
         outline: Vertices (V, 2) in m of a free outline, where the rays say that no kind fits; else None.
         current: The primitive as far as it is known.
     """
@@ -60,6 +69,8 @@ class Candidate:
     fits: list[KindFit] = field(default_factory=list)
     fitted_to: tuple[BeamModel, RayBundle] | None = None
     is_rough: bool = False
+    errors: ScannerErrors = NO_ERRORS
+    shared_errors: FloatArray | None = None
     outline: FloatArray | None = None
     current: Primitive = field(init=False)
     _cached: tuple[Background, tuple[float, float], FloatArray] | None = None
@@ -67,12 +78,20 @@ class Candidate:
     def __post_init__(self) -> None:
         self.current = self.start
 
-    def rays_with_background(self, others: Sequence[Candidate], sensor: BeamModel) -> RayBundle:
+    def rays_with_background(
+        self,
+        others: Sequence[Candidate],
+        sensor: BeamModel,
+        errors: ScannerErrors | None = None,
+        shape: Primitive | None = None,
+    ) -> RayBundle:
         """Return its rays with what they measure where they miss it: the map, walls and other candidates.
 
         Args:
             others: All candidates; those far away, and itself, are passed over.
             sensor: The sensor.
+            errors: Errors of the scanner that are taken out; None: those that are known.
+            shape: Where it is thought to be, which these depend on; None: where it was fitted last.
 
         Returns:
             Its rays, the rows OCCLUSION and BACKGROUND set.
@@ -85,9 +104,13 @@ class Candidate:
         reach = self.options.map.occluder_distance
         near = [other for other in others if other is not self and centroid_distance(other.start, self.start) < reach]
         shapes = [other.current for other in near if other.outline is None]
-        occluders = [*shapes, *(wall.stretch for wall in self.walls)]
+        walls = [wall.stretch for wall in self.walls]
         occlusion = [ranges_of(other.outline, self.bundle) for other in near if other.outline is not None]
-        return with_background(self.bundle, background, self._cached[2], occluders, sensor, occlusion)
+        errors = self.errors if errors is None else errors
+        if errors != NO_ERRORS:
+            around = Surroundings(background, self._cached[2], shapes, walls, occlusion)
+            return without_errors(self.bundle, around, shape or self.current, sensor, errors)
+        return with_background(self.bundle, background, self._cached[2], [*shapes, *walls], sensor, occlusion)
 
     def keep_rays(self, chosen: NDArray[np.bool_]) -> None:
         """Leave out all rays but the chosen ones (N,)."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from concurrent.futures import Executor
+from dataclasses import replace
 
 from detect.refinement.candidates import Candidate
 from detect.refinement.likelihood.rays import RayBundle
@@ -23,15 +24,7 @@ def find_misfits(pool: Executor, candidates: Sequence[Candidate], sensor: BeamMo
         candidates: The fitted candidates; ``outline`` is set.
         sensor: The sensor so far; its footprint and dispersion are not used, since misfits may have spoilt them.
     """
-    model = BeamModel.create(
-        sensor.std,
-        sensor.span,
-        candidates[0].options.outline.footprint,
-        1.0,
-        sensor.max_std,
-        sensor.options,
-        sensor.dropout_share,
-    )
+    model = replace(sensor, footprint=candidates[0].options.outline.footprint, dispersion=1.0)
     bundles = [candidate.rays_with_background(candidates, model) for candidate in candidates]
     work = zip(candidates, bundles, strict=True)
     found = pool.map(lambda item: _better_outline(item[0], item[1], model), work)

@@ -91,6 +91,61 @@ class SensorOptions:
     """Noise that differs by a smaller share does not make fits anew,"""
     same_dropouts: float = 0.01
     """nor do dropouts whose share differs by no more."""
+    beam_parts: tuple[float, ...] = (0.0, -0.5, 0.5, -1.0, 1.0)
+    """Directions within a wide beam, in half-widths, of which the nearest surface is read: the axis first, so that it
+    stays where none is nearer."""
+    beyond: float = 2.45
+    """Range noises; a range that is more beyond a surface is not explained by that,"""
+    unexplained: float = -3.0
+    """nats; nor by a background whose log-likelihood is less: that is at as many range noises."""
+
+
+@dataclass(frozen=True)
+class ScannerOptions:
+    """Errors that all beams of a scanner have in common, estimated from all candidates together."""
+
+    deviations: float = 5.0
+    """Standard deviations from 0 at which a range bias is told: 1 in 2 million by chance, and models are never exact.
+    """
+    considered: float = 3.0
+    """The same of the bias that the first fits show: with less nothing is fitted anew to find it."""
+    min_bias: float = 0.001
+    """m; a smaller bias is not told."""
+    max_bias: float = 0.05
+    """m; bound of the search: real scanners state 30 mm."""
+    max_step: float = 0.015
+    """m; a step of Gauss and Newton's method is no larger."""
+    steps: int = 5
+    """The most steps; they end where one is below …"""
+    last_step: float = 0.0002
+    """m; … this."""
+    difference: float = 0.25
+    """Range noises; the step of differences by the bias."""
+    agreement: float = 4.0
+    """Standard deviations from the candidates' median, its scatter included, beyond which one has no part."""
+    min_gain: float = 4.0
+    """nats a candidate, and above the dispersion, by which beams of a width must be likelier than without."""
+    reaches: tuple[float, ...] = (0.0015, 0.003, 0.006, 0.012, 0.024)
+    """rad; half-widths of beams that are tried: 0.09 to 1.4 degrees."""
+    first_reach: float = 0.003
+    """rad; where none up to this is likelier than no width, for most candidates, no others are tried."""
+    refinements: int = 3
+    """Halvings of the interval around the best."""
+    turns: int = 3
+    """Fits in a row, each with rays turned to the nearest surface of the fit before."""
+    first_footprint: float = 0.001
+    """m; the footprint is no larger where a width is looked for. Where one is known it is 0: jumps show it best."""
+    reach_std: float = 0.0003
+    """rad; standard deviation of a half-width: how the parts of a beam make one range is known no better …"""
+    relative_reach_std: float = 0.03
+    """… than this and, as a share of it, this: by how far half-widths of 0.25 to 1 degree came out too small."""
+    mixed: tuple[float, ...] = (0.004, 0.008, 0.012, 0.016, 0.024)
+    """rad; half-widths within which mixed pixels are counted."""
+    min_mixed_share: float = 0.15
+    """Share of mixed pixels, of the rays between two half-widths, from which on the wider one holds them; 0.01 to
+    0.06 are outliers and errors of the map."""
+    min_mixed: int = 20
+    """Mixed pixels; fewer are outliers."""
 
 
 @dataclass(frozen=True)
@@ -544,6 +599,7 @@ class RefinementOptions:
 
     rays: RayOptions = field(default_factory=RayOptions)
     sensor: SensorOptions = field(default_factory=SensorOptions)
+    scanner: ScannerOptions = field(default_factory=ScannerOptions)
     fit: FitOptions = field(default_factory=FitOptions)
     evidence: EvidenceOptions = field(default_factory=EvidenceOptions)
     map: MapOptions = field(default_factory=MapOptions)

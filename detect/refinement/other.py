@@ -123,7 +123,7 @@ def larger_alternatives(
     options = candidate.options
     outline, found = primitive.outline(), []
     contact = contact_of(
-        primitive, candidate.fitted_rays, candidate.cells, others, candidate.walls, sensor, options.contact
+        primitive, candidate.bundle, candidate.cells, others, candidate.walls, sensor, options.contact
     )
     if contact.cells:
         nats = contact.nats

@@ -21,12 +21,13 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from detect.detection import Detection, Detections, Rejection, UnknownObject
+from detect.detection import Detection, Detections, Rejection, SensorErrors, UnknownObject
 from detect.refinement.candidates import Candidate, find_backgrounds, fit_candidates
 from detect.refinement.fitting.evidence import compare_kinds
 from detect.refinement.likelihood.geometry import parameters_of, ranges_to
 from detect.refinement.likelihood.kernels import BACKGROUND, OCCLUSION
 from detect.refinement.likelihood.rays import RayBundle, collect_rays
+from detect.refinement.likelihood.scanner_errors import NO_ERRORS
 from detect.refinement.likelihood.sensor_model import Background, BeamModel, DistanceMap, surface_likelihood
 from detect.refinement.misfits import sensor_without_misfits
 from detect.refinement.options import DEFAULTS, AcceptanceOptions, OtherOptions, RefinementOptions
@@ -37,6 +38,7 @@ from detect.refinement.other import (
     other_log_odds,
     simple_outline,
 )
+from detect.refinement.scanner_errors import correct_scanner_errors, settle_scanner_errors, with_shared_errors
 from detect.refinement.sensor_estimation import estimate_dropouts, estimate_noise, estimate_sensor, initial_noise
 from detect.refinement.surroundings.map_cells import MapCells
 from detect.refinement.surroundings.proposals import propose
@@ -196,7 +198,7 @@ def refine_detections(
     rejected.sort(key=lambda rejection: -rejection.score)
     objects.sort(key=lambda found: -found.score)
     noise = refinement.noise_std if kept or objects else None
-    return Detections(tuple(kept), tuple(rejected), objects=tuple(objects)), noise
+    return Detections(tuple(kept), tuple(rejected), objects=tuple(objects), sensor=refinement.sensor), noise
 
 
 def _candidates_of(
@@ -362,6 +364,7 @@ class Refinement:
         guessed_noise: A first guess (m) of the noise, where there is one.
         rounds: Joint fits once duplicates are gone; None: as in the options.
         options: Numeric parameters.
+        sensor: Errors of the scanner that :meth:`run` found and corrected; None where it found none.
     """
 
     cells: MapCells
@@ -370,6 +373,7 @@ class Refinement:
     guessed_noise: float | None = None
     rounds: int | None = None
     options: RefinementOptions = field(default_factory=RefinementOptions)
+    sensor: SensorErrors | None = None
 
     def run(
         self,
@@ -425,9 +429,7 @@ class Refinement:
         dropouts = estimate_dropouts(single, noise, options.sensor)
         sensor = BeamModel.create(noise, span, max_std=max_noise, options=options.sensor, dropout_share=dropouts)
         self._fit_jointly(pool, single, sensor)
-        if not options.closed_world:
-            sensor = sensor_without_misfits(pool, single, sensor, known_noise)
-        sensor = estimate_sensor(single, sensor, known_noise)
+        sensor = self._find_sensor(pool, single, sensor, known_noise)
         disperses = sensor.dispersion > options.sensor.significant_dispersion
         fit_candidates(pool, single, [disperses] * len(single), sensor)
         self.noise_std = sensor.std
@@ -435,6 +437,19 @@ class Refinement:
         finished = pool.map(lambda item: finish(item, whole_map.background(item.bundle), sensor), single)
         results = {id(candidate): result for candidate, result in zip(single, finished, strict=True)}
         return results if options.closed_world else self._beside_others(pool, single, results, sensor)
+
+    def _find_sensor(
+        self, pool: Executor, candidates: list[Candidate], sensor: BeamModel, noise_std: float | None
+    ) -> BeamModel:
+        """Estimate the sensor by the candidates that a kind fits, once its errors are taken out of all rays."""
+        sensor = correct_scanner_errors(pool, candidates, sensor, noise_std)
+        is_corrected = candidates[0].errors != NO_ERRORS
+        if not self.options.closed_world:
+            sensor = sensor_without_misfits(pool, candidates, sensor, noise_std)
+        sensor, self.sensor = settle_scanner_errors(pool, candidates, sensor, noise_std)
+        if is_corrected and self.sensor is None and not self.options.closed_world:
+            sensor = sensor_without_misfits(pool, candidates, sensor, noise_std)  # with all errors back
+        return estimate_sensor(candidates, sensor, noise_std)
 
     def _beside_others(
         self,
@@ -549,6 +564,8 @@ def finish(candidate: Candidate, map_alone: Background, sensor: BeamModel) -> Re
     posterior = compare_kinds(candidate.fits, bundle, sensor, candidate.is_possible, evidence)
     if posterior is None:
         return None
+    posterior = with_shared_errors(posterior, candidate.shared_errors)
+    map_alone = map_alone.nearer_by(candidate.errors.range_bias)
     ratio = float(-bundle.rays[BACKGROUND].sum() - posterior.cost)
     sectors = candidate.options.acceptance.sectors
     misfit, rays, seen = _compare_with_map(posterior.primitive, bundle, map_alone, sensor, sectors)

@@ -24,7 +24,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -141,6 +141,10 @@ class Background:
     def select(self, chosen: NDArray[np.bool_]) -> Background:
         """Return the background of the chosen rays (N,)."""
         return Background(self.ranges[chosen], self.hits_map[chosen], self.blocked[chosen], self.uncertainty[chosen])
+
+    def nearer_by(self, distance: float) -> Background:
+        """Return the background with all ranges shorter by a distance (m)."""
+        return replace(self, ranges=self.ranges - distance) if distance else self
 
 
 @dataclass(frozen=True)
