@@ -132,8 +132,8 @@ class ScannerOptions:
     first_footprint: float = 0.001
     """m; the footprint is no larger where a width is looked for. Where one is known it is 0: jumps show it best."""
     reach_std: float = 0.0003
-    """rad; standard deviation of a half-width, and of where mixed pixels begin: how the parts of a beam make one range
-    is known no better …"""
+    """rad; standard deviation of a half-width, and of where mixed pixels begin: how a beam's parts make one range is
+    known no better …"""
     relative_reach_std: float = 0.03
     """… than this and, as a share of it, this: by how far half-widths of 0.25 to 1 degree came out too small."""
     mixed: tuple[float, ...] = (0.004, 0.008, 0.012, 0.016, 0.024)
