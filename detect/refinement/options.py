@@ -123,8 +123,10 @@ class ScannerOptions:
     """Range noises; the step of differences by the bias."""
     agreement: float = 4.0
     """Standard deviations from the candidates' median, its scatter included, beyond which one has no part."""
-    min_gain: float = 4.0
-    """nats a candidate, and above the dispersion, by which beams of a width must be likelier than without."""
+    min_first_gain: float = 4.0
+    """nats a candidate, times the dispersion, by which beams of a width must be likelier than without at first …"""
+    min_gain: float = 10.0
+    """… and once they are taken out; by chance it came to 7."""
     reaches: tuple[float, ...] = (0.0015, 0.003, 0.006, 0.012, 0.024)
     """rad; half-widths of beams that are tried: 0.09 to 1.4 degrees."""
     first_reach: float = 0.003
@@ -136,7 +138,8 @@ class ScannerOptions:
     first_footprint: float = 0.001
     """m; the footprint is no larger where a width is looked for. Where one is known it is 0: jumps show it best."""
     reach_std: float = 0.0003
-    """rad; standard deviation of a half-width: how the parts of a beam make one range is known no better …"""
+    """rad; standard deviation of a half-width, and of where mixed pixels begin: how a beam's parts make one range is
+    known no better …"""
     relative_reach_std: float = 0.03
     """… than this and, as a share of it, this: by how far half-widths of 0.25 to 1 degree came out too small."""
     mixed: tuple[float, ...] = (0.004, 0.008, 0.012, 0.016, 0.024)

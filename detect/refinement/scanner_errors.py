@@ -173,7 +173,7 @@ class ErrorSearch:
         likeliest = self.with_best_bias(sensor, replace(known, reach=0.0), fits)
         if is_wide:
             footprint = 0.0 if known.reach else min(sensor.footprint, options.first_footprint)
-            likeliest = self._with_width(sensor, replace(sensor, footprint=footprint), likeliest)
+            likeliest = self._with_width(sensor, replace(sensor, footprint=footprint), likeliest, known.reach > 0)
         errors = likeliest.errors
         std = common_step(likeliest, sensor, options)[1]
         is_biased = abs(errors.range_bias) >= max(options.min_bias, options.deviations * std)
@@ -234,7 +234,7 @@ class ErrorSearch:
             profile = self.at(sensor, replace(profile.errors, range_bias=bias), profile.fits)
         return profile
 
-    def _with_width(self, sensor: BeamModel, sharp: BeamModel, start: Profile) -> Profile:
+    def _with_width(self, sensor: BeamModel, sharp: BeamModel, start: Profile, is_known: bool) -> Profile:
         """Return the likeliest profile with beams of a width; the one to start with where none gains enough.
 
         A narrow one is tried first, with the sensor as it is; what is searched for is with a ``sharp`` one.
@@ -245,12 +245,27 @@ class ErrorSearch:
             gains = [a.cost - b.cost for a, b in zip(start.expansions, first.expansions, strict=True)]
             if float(np.median(gains)) > 0:
                 wide = self._with_best_reach(sharp, start)
-                narrow = min(start.cost, self.at(sharp, start.errors, start.fits).cost)
-                enough = options.min_gain * len(self.trusted) * sensor.dispersion
-                return wide if narrow - min(wide.cost, first.cost) > enough else start
+                narrow = self.at(sharp, start.errors, start.fits)
+                return wide if self._gains(start, narrow, first, wide, sensor, is_known) else start
             if reach >= options.first_reach:
                 break
         return start
+
+    def _gains(
+        self, start: Profile, narrow: Profile, first: Profile, wide: Profile, sensor: BeamModel, is_known: bool
+    ) -> bool:
+        """Tell whether a width gains enough.
+
+        Where one was found before it must do so with the sharp sensor (``narrow`` and ``wide``): a footprint that is
+        too large can make up for a width. At first either sensor may show it, as it was (``start`` and ``first``) or
+        sharp: then the other errors that a width brings about are in the fits still.
+        """
+        if is_known:
+            gain, needed = narrow.cost - wide.cost, self.options.min_gain
+        else:
+            gain = min(start.cost, narrow.cost) - min(wide.cost, first.cost)
+            needed = self.options.min_first_gain
+        return gain > needed * len(self.trusted) * sensor.dispersion
 
     def _with_best_reach(self, sensor: BeamModel, start: Profile) -> Profile:
         """Return the likeliest profile with beams of a width: the best of some, then halfway to its neighbours."""
@@ -314,14 +329,15 @@ class ErrorSearch:
         everyone = replace(self, trusted=self.candidates)
         profile = everyone.at(sensor, errors, [candidate.fits[0] for candidate in self.candidates])
         changes = [[] if std is None else [std * one.slope] for one in profile.expansions]
-        if errors.reach:
+        if errors.reach or errors.mixed:
             unsure = math.hypot(options.reach_std, options.relative_reach_std * errors.reach)
             less, more = (
-                everyone.at(sensor, replace(errors, reach=errors.reach + sign * unsure), profile.fits).fits
-                for sign in (-1, 1)
+                everyone.at(sensor, replace(errors, reach=reach), profile.fits).fits
+                for reach in (max(errors.reach - unsure, 0.0), errors.reach + unsure)
             )
+            step = 0.5 if errors.reach else 1.0
             for change, before, after in zip(changes, less, more, strict=True):
-                change.append(0.5 * (after.p - before.p))
+                change.append(step * (after.p - before.p))
         for candidate, fit, change in zip(self.candidates, profile.fits, changes, strict=True):
             candidate.is_rough = True  # fitted once more, with the sensor as it was estimated last
             candidate.shared_errors = _longer_first(fit, np.array(change).T) if change else None
