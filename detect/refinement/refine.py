@@ -40,6 +40,7 @@ from detect.refinement.other import (
 from detect.refinement.sensor_estimation import estimate_noise, estimate_sensor, initial_noise
 from detect.refinement.surroundings.map_cells import MapCells
 from detect.refinement.surroundings.proposals import propose
+from detect.refinement.touching import Site, Trial, find_sites, tell_apart
 from mapping.grid import OccupancyGrid
 from prim.arrays import FloatArray
 from prim.metrics import overlap_coefficient
@@ -182,7 +183,9 @@ def refine_detections(
     kept: list[Detection] = []
     objects: list[UnknownObject] = []
     rejected = []
-    for number, (guess, result) in enumerate(zip(wanted, refined, strict=True)):
+    results = [*enumerate(refined), *refinement.further]
+    for number, result in results:
+        guess = wanted[number]
         if number < found:
             reason = rejection_reason(result, options.acceptance)
         else:
@@ -365,6 +368,8 @@ class Refinement:
         guessed_noise: A first guess (m) of the noise, where there is one.
         rounds: Joint fits once duplicates are gone; None: as in the options.
         options: Numeric parameters.
+        further: Of things that were told apart by :meth:`run`, those beyond the guesses: with the index of the guess
+            that they were a part of.
     """
 
     cells: MapCells
@@ -373,6 +378,8 @@ class Refinement:
     guessed_noise: float | None = None
     rounds: int | None = None
     options: RefinementOptions = field(default_factory=RefinementOptions)
+    further: list[tuple[int, RefinedPrimitive]] = field(default_factory=list)
+    _told_apart: list[Trial] = field(default_factory=list)
 
     def run(
         self,
@@ -398,21 +405,56 @@ class Refinement:
         """
         if not primitives:
             return []
-        bundles, span, max_noise = collect_rays(scans, primitives, self.options.rays.reach, self.options, since)
+        sites = [] if self.options.closed_world else find_sites(self.cells, primitives, self.options)
+        alone = [site for site in sites if site.covered_by is None]
+        circles = [site.circle for site in alone]
+        stamps = list(since or [None] * len(primitives))
+        stamps += [stamps[site.members[0]] for site in alone]
+        reach = self.options.rays.reach
+        bundles, span, max_noise = collect_rays(scans, [*primitives, *circles], reach, self.options, stamps)
+        for site, bundle in zip(alone, bundles[len(primitives) :], strict=True):
+            site.bundle = bundle
         detections = known or {}
         candidates = [
             Candidate(start, bundle, self.cells, detections.get(number), self.options)
-            for number, (start, bundle) in enumerate(zip(primitives, bundles, strict=True))
+            for number, (start, bundle) in enumerate(zip(primitives, bundles, strict=False))
         ]
+        for site in sites:
+            site.take(candidates)
         seen = [candidate for candidate in candidates if len(candidate.bundle)]
         results: dict[int, RefinedPrimitive | None] = {}
         if seen:
             with ThreadPoolExecutor(self.threads) as pool:
-                results = self._refine(pool, seen, candidates[:preferred], span, max_noise)
-        return [results.get(id(candidate)) for candidate in candidates]
+                results = self._refine(pool, seen, candidates[:preferred], sites, span, max_noise)
+        return self._in_order(candidates, results)
+
+    def _in_order(
+        self, candidates: Sequence[Candidate], results: Mapping[int, RefinedPrimitive | None]
+    ) -> list[RefinedPrimitive | None]:
+        """Return the results of all guesses; of those that were told apart, each has the part most like it, and the
+        further parts go to ``further``."""
+        numbers = {id(candidate): number for number, candidate in enumerate(candidates)}
+        ordered = [results.get(id(candidate)) for candidate in candidates]
+        self.further = []
+        for trial in self._told_apart:
+            left = list(trial.parts)
+            for guess in trial.site.candidates:
+                if left:
+                    best = max(left, key=lambda part: overlap_coefficient(part.current, guess.start))
+                    left.remove(best)
+                    ordered[numbers[id(guess)]] = results.get(id(best))
+            first = numbers[id(trial.site.candidates[0])]
+            self.further += [(first, result) for part in left if (result := results.get(id(part)))]
+        return ordered
 
     def _refine(
-        self, pool: Executor, seen: list[Candidate], preferred: list[Candidate], span: float, max_noise: float
+        self,
+        pool: Executor,
+        seen: list[Candidate],
+        preferred: list[Candidate],
+        sites: Sequence[Site],
+        span: float,
+        max_noise: float,
     ) -> dict[int, RefinedPrimitive | None]:
         """Search, remove duplicates, fit jointly, estimate the sensor, and compare kinds; results by id."""
         options, known_noise = self.options, self.noise_std
@@ -428,6 +470,7 @@ class Refinement:
         self._fit_jointly(pool, single, sensor)
         if not options.closed_world:
             sensor = sensor_without_misfits(pool, single, sensor, known_noise)
+            single, sensor = self._tell_apart(pool, sites, single, sensor)
         sensor = estimate_sensor(single, sensor, known_noise)
         disperses = sensor.dispersion > options.sensor.significant_dispersion
         fit_candidates(pool, single, [disperses] * len(single), sensor)
@@ -436,6 +479,19 @@ class Refinement:
         finished = pool.map(lambda item: finish(item, whole_map.background(item.bundle), sensor), single)
         results = {id(candidate): result for candidate, result in zip(single, finished, strict=True)}
         return results if options.closed_world else self._beside_others(pool, single, results, sensor)
+
+    def _tell_apart(
+        self, pool: Executor, sites: Sequence[Site], candidates: list[Candidate], sensor: BeamModel
+    ) -> tuple[list[Candidate], BeamModel]:
+        """Put two candidates where one fits no kind and two do; with them the sensor is estimated anew."""
+        self._told_apart = tell_apart(pool, sites, candidates, sensor)
+        if not self._told_apart:
+            return candidates, sensor
+        replaced = {id(candidate) for trial in self._told_apart for candidate in trial.before}
+        parts = self._near_rays([part for trial in self._told_apart for part in trial.parts])
+        present = [*(candidate for candidate in candidates if id(candidate) not in replaced), *parts]
+        self._fit_jointly(pool, present, sensor)
+        return present, sensor_without_misfits(pool, present, sensor, self.noise_std)
 
     def _beside_others(
         self,
