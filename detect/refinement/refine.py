@@ -488,7 +488,7 @@ class Refinement:
         if not self._told_apart:
             return candidates, sensor
         replaced = {id(candidate) for trial in self._told_apart for candidate in trial.before}
-        parts = self._near_rays([part for trial in self._told_apart for part in trial.parts])
+        parts = [part for trial in self._told_apart for part in trial.parts]
         present = [*(candidate for candidate in candidates if id(candidate) not in replaced), *parts]
         self._fit_jointly(pool, present, sensor)
         return present, sensor_without_misfits(pool, present, sensor, self.noise_std)

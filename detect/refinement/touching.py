@@ -239,6 +239,8 @@ def _fit_parts(
         trial.parts = [_part(guess, trial.whole, options.rays.reach) for guess in guesses]
     parts = [part for trial in trials for part in trial.parts]
     for left in reversed(range(options.touching.rounds)):
+        for part in parts if not left else []:
+            part.keep_rays(part.bundle.passing(part.current, options.rays.fitted_reach))
         fit_candidates(pool, parts, [left > 0] * len(parts), sensor, beside)
     if parts:
         find_misfits(pool, parts, sensor, beside)

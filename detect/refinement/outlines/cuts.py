@@ -229,8 +229,9 @@ def _are_one_piece(a: Primitive, b: Primitive, options: TouchingOptions) -> bool
         return True
     (corners, normals), (others, facing) = _sides(a), _sides(b)
     same = normals @ facing.T > math.cos(options.aligned)
-    offsets = (normals * corners).sum(axis=1)[:, None] - others @ normals.T
-    return bool((same & (np.abs(offsets.T) < options.coincidence)).any())
+    halfway = (others + np.roll(others, -1, axis=0)) / 2
+    offsets = normals @ halfway.T - (normals * corners).sum(axis=1)[:, None]
+    return bool((same & (np.abs(offsets) < options.coincidence)).any())
 
 
 def _sides(primitive: Primitive) -> tuple[FloatArray, FloatArray]:
