@@ -478,8 +478,10 @@ class TouchingOptions:
     """Cuts that are compared by area: the shortest, for the outline that they cut off."""
     round_vertices: int = 24
     """Vertices that stand for round shapes there."""
-    tries: int = 2
-    """Partitions that are fitted to the rays, those whose parts are most like primitives."""
+    tries: int = 3
+    """Partitions that are fitted to the rays, those whose parts are most like primitives,"""
+    alike: float = 0.8
+    """leaving out those whose parts have more than this in common (IoU) with another's."""
     rounds: int = 3
     """Fits of the parts beside each other; all but the last are searches."""
     min_rays: int = 40

@@ -27,7 +27,7 @@ from detect.refinement.outlines.cuts import Partition, is_one_piece, partitions
 from detect.refinement.outlines.polygons import contour_of, fit_polygons
 from detect.refinement.surroundings.map_cells import MapCells, is_within
 from mapping.morphology import label
-from prim.arrays import FloatArray
+from prim.metrics import polygon_iou
 from prim.shapes import Kind, Primitive
 
 
@@ -118,9 +118,10 @@ class Trial:
         site: The site.
         before: The candidates that stand in it.
         whole: The site as a candidate, with all of its rays.
-        evidence: Log evidence (nats) of one free polygon.
+        evidence: Log evidence (nats) of what explains its rays best: one free polygon at first.
         partitions: Its outline cut in two, in the order in which they are tried.
-        parts: The parts that are tried.
+        tried: The parts of the partition that was fitted last.
+        parts: The parts that explain the rays best; none where one polygon does.
     """
 
     site: Site
@@ -128,6 +129,7 @@ class Trial:
     whole: Candidate
     evidence: float = -math.inf
     partitions: list[Partition] = field(default_factory=list)
+    tried: list[Candidate] = field(default_factory=list)
     parts: list[Candidate] = field(default_factory=list)
 
 
@@ -163,14 +165,14 @@ def tell_apart(
     beside = [candidate for candidate in candidates if id(candidate) not in taken]
     _set_backgrounds(pool, trials, beside, options)
     list(pool.map(lambda trial: _cut(trial, beside, sensor), trials))
-    succeeded = []
     for _ in range(options.touching.tries):
-        trials = [trial for trial in trials if trial.partitions]
-        _fit_parts(pool, trials, beside, sensor, options)
-        fit = [_is_better(trial, beside, sensor) for trial in trials]
-        succeeded += [trial for trial, good in zip(trials, fit, strict=True) if good]
-        trials = [trial for trial, good in zip(trials, fit, strict=True) if not good]
-    return succeeded
+        tried = [trial for trial in trials if trial.partitions]
+        _fit_parts(pool, tried, beside, sensor, options)
+        for trial in tried:
+            evidence = _log_evidence_of_parts(trial, beside, sensor)
+            if evidence > trial.evidence:
+                trial.evidence, trial.parts = evidence, trial.tried
+    return [trial for trial in trials if trial.parts]
 
 
 def _is_suspicious(site: Site, before: Sequence[Candidate]) -> bool:
@@ -223,7 +225,24 @@ def _cut(trial: Trial, beside: Sequence[Candidate], sensor: BeamModel) -> None:
     bundle = whole.rays_with_background(beside, sensor)
     fit = fit_polygons([contour], bundle, sensor, polygon)
     trial.evidence = fit.log_evidence
-    trial.partitions = (partitions(fit.vertices, touching) or partitions(contour, touching))[: touching.tries]
+    made = [*partitions(fit.vertices, touching), *partitions(contour, touching)]
+    trial.partitions = _different(sorted(made, key=lambda partition: partition.mismatch), touching)
+
+
+def _different(made: Sequence[Partition], options: TouchingOptions) -> list[Partition]:
+    """Return the first partitions, leaving out those whose parts are all but those of an earlier one."""
+    chosen: list[Partition] = []
+    for partition in made:
+        if len(chosen) == options.tries:
+            break
+        if not any(_are_alike(partition, earlier, options) for earlier in chosen):
+            chosen.append(partition)
+    return chosen
+
+
+def _are_alike(a: Partition, b: Partition, options: TouchingOptions) -> bool:
+    """Tell whether each part of one partition is like one of the other's."""
+    return all(max(polygon_iou(one, other) for other in b.guesses) > options.alike for one in a.guesses)
 
 
 def _fit_parts(
@@ -236,8 +255,8 @@ def _fit_parts(
     """Fit the parts of each trial's next partition beside each other."""
     for trial in trials:
         guesses = trial.partitions.pop(0).guesses
-        trial.parts = [_part(guess, trial.whole, options.rays.reach) for guess in guesses]
-    parts = [part for trial in trials for part in trial.parts]
+        trial.tried = [_part(guess, trial.whole, options.rays.reach) for guess in guesses]
+    parts = [part for trial in trials for part in trial.tried]
     for left in reversed(range(options.touching.rounds)):
         for part in parts if not left else []:
             part.keep_rays(part.bundle.passing(part.current, options.rays.fitted_reach))
@@ -254,28 +273,41 @@ def _part(guess: Primitive, whole: Candidate, reach: float) -> Candidate:
     return part
 
 
-def _is_better(trial: Trial, beside: Sequence[Candidate], sensor: BeamModel) -> bool:
-    """Tell whether parts explain a site's rays better than one polygon, and each fits a kind."""
-    options = trial.whole.options
-    if any(part.outline is not None for part in trial.parts) or is_one_piece(
-        [part.current for part in trial.parts], options.touching
-    ):
-        return False
-    present = [*trial.parts, *beside]
-    for part in trial.parts:
+def _log_evidence_of_parts(trial: Trial, beside: Sequence[Candidate], sensor: BeamModel) -> float:
+    """Return the log evidence (nats) of a site's rays if the parts that are tried stand there, by Laplace's method;
+    -inf where one of them fits no kind, or met by few rays, or all are one thing."""
+    options, parts = trial.whole.options, trial.tried
+    if any(part.outline is not None for part in parts):
+        return -math.inf
+    if is_one_piece([part.current for part in parts], options.touching):
+        return -math.inf
+    present = [*parts, *beside]
+    for part in parts:
         bundle = part.rays_with_background(present, sensor)
         ratio = float(-bundle.rays[BACKGROUND].sum() - part.fits[0].cost)
         met = np.count_nonzero(ranges_to(part.current, bundle.rays) < bundle.rays[OCCLUSION])
         if ratio < options.acceptance.min_log_ratio or met < options.touching.min_rays:
-            return False
-    return log_evidence_of(trial, beside, sensor) > trial.evidence
+            return -math.inf
+    return log_evidence_of(parts, trial.whole, beside, sensor)
 
 
-def log_evidence_of(trial: Trial, beside: Sequence[Candidate], sensor: BeamModel) -> float:
-    """Return the log evidence (nats) of a site's rays if its parts stand there, by Laplace's method."""
-    first, evidence = trial.parts[0].fits[0], trial.whole.options.evidence
-    bundle = trial.whole.rays_with_background([*trial.parts[1:], *beside], sensor)
+def log_evidence_of(
+    parts: Sequence[Candidate], whole: Candidate, beside: Sequence[Candidate], sensor: BeamModel
+) -> float:
+    """Approximate the log evidence of a site's rays by Laplace's method.
+
+    Args:
+        parts: The fitted candidates that stand there.
+        whole: The site with its rays.
+        beside: The candidates elsewhere.
+        sensor: The sensor.
+
+    Returns:
+        Nats, comparable with a polygon's.
+    """
+    first, evidence = parts[0].fits[0], whole.options.evidence
+    bundle = whole.rays_with_background([*parts[1:], *beside], sensor)
     cost = float(exact_costs(first.kind, first.p[None], bundle, sensor)[0])
-    fits = [part.fits[0] for part in trial.parts]
+    fits = [part.fits[0] for part in parts]
     volumes = sum(laplace_evidence(fit, sensor.dispersion, evidence) + fit.cost / sensor.dispersion for fit in fits)
     return -cost / sensor.dispersion + volumes
