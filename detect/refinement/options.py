@@ -470,10 +470,14 @@ class TouchingOptions:
     unexplained: float = 0.25
     """Share of a component's cells that no candidate covers, above which two things are tried although each
     candidate fits a kind."""
+    simplification: float = 0.7
+    """cells; tolerance of one of the contours that are cut: a neck may be a cell deep."""
     min_turn: float = 0.25
     """rad; an outline is concave where it turns inwards by more."""
     min_share: float = 0.06
     """A part has this share of the area at least."""
+    max_mismatch: float = 0.2
+    """Area by which parts and primitives differ, as a share of the whole: above this a partition is not tried."""
     max_cuts: int = 12
     """Cuts that are compared by area: the shortest, for the outline that they cut off."""
     round_vertices: int = 24
@@ -486,6 +490,10 @@ class TouchingOptions:
     """Fits of the parts beside each other; all but the last are searches."""
     min_rays: int = 40
     """Rays that meet each part."""
+    min_nats: float = 15.0
+    """nats; by which one thing is likelier a priori than two that touch, and that are tried in several ways."""
+    max_shared: float = 0.06
+    """Share of the smaller area that parts have in common at most: things do not overlap."""
     aligned: float = 0.03
     """rad; sides that differ by less in direction are parallel."""
     coincidence: float = 0.004

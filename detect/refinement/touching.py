@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from concurrent.futures import Executor
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,10 +24,11 @@ from detect.refinement.likelihood.sensor_model import BeamModel, DistanceMap
 from detect.refinement.misfits import find_misfits
 from detect.refinement.options import DEFAULTS, RefinementOptions, TouchingOptions
 from detect.refinement.outlines.cuts import Partition, is_one_piece, partitions
+from detect.refinement.outlines.free_outline import OutlineCost, StarOutline, fit_free_outline
 from detect.refinement.outlines.polygons import contour_of, fit_polygons
 from detect.refinement.surroundings.map_cells import MapCells, is_within
 from mapping.morphology import label
-from prim.metrics import polygon_iou
+from prim.metrics import overlap_coefficient, polygon_iou
 from prim.shapes import Kind, Primitive
 
 
@@ -172,7 +173,9 @@ def tell_apart(
             evidence = _log_evidence_of_parts(trial, beside, sensor)
             if evidence > trial.evidence:
                 trial.evidence, trial.parts = evidence, trial.tried
-    return [trial for trial in trials if trial.parts]
+    found = [trial for trial in trials if trial.parts]
+    outlines = pool.map(lambda trial: _outline_evidence(trial, beside, sensor), found)
+    return [trial for trial, evidence in zip(found, outlines, strict=True) if trial.evidence > evidence]
 
 
 def _is_suspicious(site: Site, before: Sequence[Candidate]) -> bool:
@@ -224,9 +227,27 @@ def _cut(trial: Trial, beside: Sequence[Candidate], sensor: BeamModel) -> None:
         return
     bundle = whole.rays_with_background(beside, sensor)
     fit = fit_polygons([contour], bundle, sensor, polygon)
-    trial.evidence = fit.log_evidence
-    made = [*partitions(fit.vertices, touching), *partitions(contour, touching)]
+    trial.evidence = fit.log_evidence + touching.min_nats
+    fine = replace(polygon, simplification=touching.simplification)
+    finer = contour_of(whole.start, whole.cells, [one.current for one in beside], whole.walls, fine)
+    outlines = [fit.vertices, contour, *([] if finer is None else [finer])]
+    made = [partition for outline in outlines for partition in partitions(outline, touching)]
     trial.partitions = _different(sorted(made, key=lambda partition: partition.mismatch), touching)
+
+
+def _outline_evidence(trial: Trial, beside: Sequence[Candidate], sensor: BeamModel) -> float:
+    """Return what the log evidence (nats) of a site's parts must exceed: that of one free outline about a candidate."""
+    whole = trial.whole
+    outline = whole.options.outline
+    model = replace(sensor, footprint=outline.footprint)
+    bundle = whole.rays_with_background(beside, sensor)
+    made = [-math.inf]
+    for candidate in trial.before:
+        if candidate.outline is not None:
+            cost = OutlineCost(StarOutline.of(candidate.current, outline), bundle, sensor, outline)
+            factor = fit_free_outline(cost, model.footprint, outline).log_bayes_factor
+            made.append(log_evidence_of([candidate], whole, beside, model) + factor)
+    return max(made) + whole.options.touching.min_nats
 
 
 def _different(made: Sequence[Partition], options: TouchingOptions) -> list[Partition]:
@@ -279,7 +300,8 @@ def _log_evidence_of_parts(trial: Trial, beside: Sequence[Candidate], sensor: Be
     options, parts = trial.whole.options, trial.tried
     if any(part.outline is not None for part in parts):
         return -math.inf
-    if is_one_piece([part.current for part in parts], options.touching):
+    shapes = [part.current for part in parts]
+    if is_one_piece(shapes, options.touching) or _overlap(shapes) > options.touching.max_shared:
         return -math.inf
     present = [*parts, *beside]
     for part in parts:
@@ -289,6 +311,11 @@ def _log_evidence_of_parts(trial: Trial, beside: Sequence[Candidate], sensor: Be
         if ratio < options.acceptance.min_log_ratio or met < options.touching.min_rays:
             return -math.inf
     return log_evidence_of(parts, trial.whole, beside, sensor)
+
+
+def _overlap(shapes: Sequence[Primitive]) -> float:
+    """Return the largest share of the smaller area that two of some primitives have in common."""
+    return max(overlap_coefficient(a, b) for n, a in enumerate(shapes) for b in shapes[n + 1 :])
 
 
 def log_evidence_of(

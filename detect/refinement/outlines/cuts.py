@@ -57,7 +57,8 @@ def partitions(vertices: FloatArray, options: TouchingOptions = DEFAULTS.touchin
             continue
         likest = [_most_like(part, options) for part in parts]
         mismatch = sum(different for _, different in likest) / whole.area
-        made.append(Partition(tuple(guess for guess, _ in likest), mismatch))
+        if mismatch < options.max_mismatch:
+            made.append(Partition(tuple(guess for guess, _ in likest), mismatch))
     return sorted(made, key=lambda partition: partition.mismatch)
 
 
