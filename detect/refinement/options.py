@@ -450,6 +450,8 @@ class OtherOptions:
     polygon_handicap: float = 5.0
     """nats; by which polygons are less likely a priori than deformed primitives: their number of vertices is chosen
     by the same rays."""
+    majority: float = 0.51
+    """Posterior probability from which on it is told as none of the kinds: even odds (``flush``) leave it a kind."""
     flush: float = 1.0
     """Odds that a thing with a side flush with a wall, or with another thing, is a part of it: a free-standing one
     seldom stands so exactly, parts always do, and the rays cannot tell them apart."""
@@ -476,7 +478,7 @@ class TouchingOptions:
     """rad; an outline is concave where it turns inwards by more."""
     min_share: float = 0.06
     """A part has this share of the area at least."""
-    max_mismatch: float = 0.2
+    max_mismatch: float = 0.16
     """Area by which parts and primitives differ, as a share of the whole: above this a partition is not tried."""
     max_cuts: int = 12
     """Cuts that are compared by area: the shortest, for the outline that they cut off."""

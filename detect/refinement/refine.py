@@ -89,7 +89,7 @@ class RefinedPrimitive:
     @property
     def is_other(self) -> bool:
         """Whether it is likelier none of the kinds than one of them."""
-        return self.alternative is not None and self.other_probability > 0.5
+        return self.alternative is not None and self.other_probability > DEFAULTS.other.majority
 
     def beside(self, alternatives: Sequence[Alternative], options: OtherOptions) -> RefinedPrimitive:
         """Hold the kinds against alternatives.
@@ -515,11 +515,17 @@ class Refinement:
 
         def larger(one: Candidate) -> list[Alternative]:
             others = [primitive for key, primitive in kept.items() if key != id(one)]
+            others += [part.current for part in self._parts_beside(one) if id(part) not in kept]
             return larger_alternatives(one, kept[id(one)], others, sensor)
 
         for one, parts in zip(rest, pool.map(larger, rest), strict=True):
             beside[id(one)] = _required(results[id(one)]).beside([*shapes[id(one)], *parts], other)
         return beside
+
+    def _parts_beside(self, candidate: Candidate) -> list[Candidate]:
+        """Return the other parts of what a candidate was told apart from."""
+        trials = [trial for trial in self._told_apart if candidate in trial.parts]
+        return [part for trial in trials for part in trial.parts if part is not candidate]
 
     def _near_rays(self, candidates: list[Candidate]) -> list[Candidate]:
         """Leave out rays that pass far from the fits, and candidates without any."""

@@ -23,7 +23,8 @@ from detect.refinement.likelihood.rays import RayBundle
 from detect.refinement.likelihood.sensor_model import BeamModel, DistanceMap
 from detect.refinement.misfits import find_misfits
 from detect.refinement.options import DEFAULTS, RefinementOptions, TouchingOptions
-from detect.refinement.outlines.cuts import Partition, is_one_piece, partitions
+from detect.refinement.outlines.cuts import Partition, partitions
+from detect.refinement.outlines.flush import is_one_piece
 from detect.refinement.outlines.free_outline import OutlineCost, StarOutline, fit_free_outline
 from detect.refinement.outlines.polygons import contour_of, fit_polygons
 from detect.refinement.surroundings.map_cells import MapCells, is_within
@@ -119,15 +120,18 @@ class Trial:
         site: The site.
         before: The candidates that stand in it.
         whole: The site as a candidate, with all of its rays.
-        evidence: Log evidence (nats) of what explains its rays best: one free polygon at first.
+        alone: Log evidence (nats) of one thing there: the best of a free polygon, a free outline, and parts that are
+            made as one thing.
+        evidence: That of the parts.
         partitions: Its outline cut in two, in the order in which they are tried.
         tried: The parts of the partition that was fitted last.
-        parts: The parts that explain the rays best; none where one polygon does.
+        parts: The parts that explain the rays better than one thing; none where none do.
     """
 
     site: Site
     before: list[Candidate]
     whole: Candidate
+    alone: float = -math.inf
     evidence: float = -math.inf
     partitions: list[Partition] = field(default_factory=list)
     tried: list[Candidate] = field(default_factory=list)
@@ -167,15 +171,13 @@ def tell_apart(
     _set_backgrounds(pool, trials, beside, options)
     list(pool.map(lambda trial: _cut(trial, beside, sensor), trials))
     for _ in range(options.touching.tries):
-        tried = [trial for trial in trials if trial.partitions]
+        tried = [trial for trial in trials if trial.partitions and not trial.parts]
         _fit_parts(pool, tried, beside, sensor, options)
         for trial in tried:
-            evidence = _log_evidence_of_parts(trial, beside, sensor)
-            if evidence > trial.evidence:
-                trial.evidence, trial.parts = evidence, trial.tried
+            _judge(trial, beside, sensor)
     found = [trial for trial in trials if trial.parts]
-    outlines = pool.map(lambda trial: _outline_evidence(trial, beside, sensor), found)
-    return [trial for trial, evidence in zip(found, outlines, strict=True) if trial.evidence > evidence]
+    list(pool.map(lambda trial: _hold_against_outlines(trial, beside, sensor), found))
+    return [trial for trial in found if trial.parts and trial.evidence > trial.alone]
 
 
 def _is_suspicious(site: Site, before: Sequence[Candidate]) -> bool:
@@ -227,7 +229,7 @@ def _cut(trial: Trial, beside: Sequence[Candidate], sensor: BeamModel) -> None:
         return
     bundle = whole.rays_with_background(beside, sensor)
     fit = fit_polygons([contour], bundle, sensor, polygon)
-    trial.evidence = fit.log_evidence + touching.min_nats
+    trial.alone = fit.log_evidence + touching.min_nats
     fine = replace(polygon, simplification=touching.simplification)
     finer = contour_of(whole.start, whole.cells, [one.current for one in beside], whole.walls, fine)
     outlines = [fit.vertices, contour, *([] if finer is None else [finer])]
@@ -235,19 +237,18 @@ def _cut(trial: Trial, beside: Sequence[Candidate], sensor: BeamModel) -> None:
     trial.partitions = _different(sorted(made, key=lambda partition: partition.mismatch), touching)
 
 
-def _outline_evidence(trial: Trial, beside: Sequence[Candidate], sensor: BeamModel) -> float:
-    """Return what the log evidence (nats) of a site's parts must exceed: that of one free outline about a candidate."""
+def _hold_against_outlines(trial: Trial, beside: Sequence[Candidate], sensor: BeamModel) -> None:
+    """Hold parts against one free outline about each candidate that no kind fits."""
     whole = trial.whole
-    outline = whole.options.outline
-    model = replace(sensor, footprint=outline.footprint)
+    options = whole.options.outline
+    model = replace(sensor, footprint=options.footprint)
     bundle = whole.rays_with_background(beside, sensor)
-    made = [-math.inf]
     for candidate in trial.before:
         if candidate.outline is not None:
-            cost = OutlineCost(StarOutline.of(candidate.current, outline), bundle, sensor, outline)
-            factor = fit_free_outline(cost, model.footprint, outline).log_bayes_factor
-            made.append(log_evidence_of([candidate], whole, beside, model) + factor)
-    return max(made) + whole.options.touching.min_nats
+            cost = OutlineCost(StarOutline.of(candidate.current, options), bundle, sensor, options)
+            factor = fit_free_outline(cost, model.footprint, options).log_bayes_factor
+            evidence = log_evidence_of([candidate], whole, beside, model) + factor
+            trial.alone = max(trial.alone, evidence + whole.options.touching.min_nats)
 
 
 def _different(made: Sequence[Partition], options: TouchingOptions) -> list[Partition]:
@@ -294,23 +295,27 @@ def _part(guess: Primitive, whole: Candidate, reach: float) -> Candidate:
     return part
 
 
-def _log_evidence_of_parts(trial: Trial, beside: Sequence[Candidate], sensor: BeamModel) -> float:
-    """Return the log evidence (nats) of a site's rays if the parts that are tried stand there, by Laplace's method;
-    -inf where one of them fits no kind, or met by few rays, or all are one thing."""
-    options, parts = trial.whole.options, trial.tried
-    if any(part.outline is not None for part in parts):
-        return -math.inf
+def _judge(trial: Trial, beside: Sequence[Candidate], sensor: BeamModel) -> None:
+    """Take the parts that were tried where they are likelier than one thing, and each fits a kind."""
+    touching, parts = trial.whole.options.touching, trial.tried
+    if not all(_fits(part, [*parts, *beside], sensor) for part in parts):
+        return
+    evidence = log_evidence_of(parts, trial.whole, beside, sensor)
     shapes = [part.current for part in parts]
-    if is_one_piece(shapes, options.touching) or _overlap(shapes) > options.touching.max_shared:
-        return -math.inf
-    present = [*parts, *beside]
-    for part in parts:
-        bundle = part.rays_with_background(present, sensor)
-        ratio = float(-bundle.rays[BACKGROUND].sum() - part.fits[0].cost)
-        met = np.count_nonzero(ranges_to(part.current, bundle.rays) < bundle.rays[OCCLUSION])
-        if ratio < options.acceptance.min_log_ratio or met < options.touching.min_rays:
-            return -math.inf
-    return log_evidence_of(parts, trial.whole, beside, sensor)
+    if is_one_piece(shapes, touching):
+        trial.alone = max(trial.alone, evidence + touching.min_nats)
+    elif _overlap(shapes) < touching.max_shared and evidence > trial.alone:
+        trial.evidence, trial.parts = evidence, parts
+
+
+def _fits(part: Candidate, present: Sequence[Candidate], sensor: BeamModel) -> bool:
+    """Tell whether a part fits a kind, and enough rays say so."""
+    options = part.options
+    bundle = part.rays_with_background(present, sensor)
+    ratio = float(-bundle.rays[BACKGROUND].sum() - part.fits[0].cost)
+    met = np.count_nonzero(ranges_to(part.current, bundle.rays) < bundle.rays[OCCLUSION])
+    enough = ratio > options.acceptance.min_log_ratio and met > options.touching.min_rays
+    return part.outline is None and enough
 
 
 def _overlap(shapes: Sequence[Primitive]) -> float:
