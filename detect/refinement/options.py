@@ -494,6 +494,8 @@ class TouchingOptions:
     """Rays that meet each part."""
     min_nats: float = 15.0
     """nats; by which one thing is likelier a priori than two that touch, and that are tried in several ways."""
+    sure_nats: float = 100.0
+    """nats; parts that are likelier than one thing by more are not tried otherwise."""
     max_shared: float = 0.06
     """Share of the smaller area that parts have in common at most: things do not overlap."""
     aligned: float = 0.03

@@ -431,18 +431,16 @@ class Refinement:
     def _in_order(
         self, candidates: Sequence[Candidate], results: Mapping[int, RefinedPrimitive | None]
     ) -> list[RefinedPrimitive | None]:
-        """Return the results of all guesses; of those that were told apart, each has the part most like it, and the
-        further parts go to ``further``."""
+        """Return the results of all guesses; those told apart have the part most like them, ``further`` the others."""
         numbers = {id(candidate): number for number, candidate in enumerate(candidates)}
         ordered = [results.get(id(candidate)) for candidate in candidates]
         self.further = []
         for trial in self._told_apart:
             left = list(trial.parts)
-            for guess in trial.site.candidates:
-                if left:
-                    best = max(left, key=lambda part: overlap_coefficient(part.current, guess.start))
-                    left.remove(best)
-                    ordered[numbers[id(guess)]] = results.get(id(best))
+            for guess in trial.site.candidates[: len(left)]:
+                best = max(left, key=lambda part: overlap_coefficient(part.current, guess.start))
+                left.remove(best)
+                ordered[numbers[id(guess)]] = results.get(id(best))
             first = numbers[id(trial.site.candidates[0])]
             self.further += [(first, result) for part in left if (result := results.get(id(part)))]
         return ordered

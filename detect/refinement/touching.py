@@ -60,9 +60,7 @@ class Site:
             self.bundle = candidates[self.covered_by].bundle
 
 
-def find_sites(
-    cells: MapCells, guesses: Sequence[Primitive], options: RefinementOptions = DEFAULTS
-) -> list[Site]:
+def find_sites(cells: MapCells, guesses: Sequence[Primitive], options: RefinementOptions = DEFAULTS) -> list[Site]:
     """Find the components that guesses stand in.
 
     Args:
@@ -85,15 +83,13 @@ def find_sites(
     order = np.argsort(labels.flat[where], kind="stable")
     where = where[order]
     found = []
-    for part in np.split(where, np.flatnonzero(np.diff(labels.flat[where])) + 1):
-        if not len(part):
-            continue
-        rows, cols = np.divmod(part, cells.frame.cols)
-        circle = _circle_around(cells, rows, cols)
-        own = members[int(labels.flat[part[0]])]
+    for part in np.split(where, np.flatnonzero(np.diff(labels.flat[where])) + 1) if members else []:
+        at = np.divmod(part, cells.frame.cols)
+        circle = _circle_around(cells, *at)
+        standing = members[int(labels.flat[part[0]])]
         if circle.bounding_radius <= options.touching.max_radius:
-            sufficient = (number for number in own if _covers(guesses[number], circle, options))
-            found.append(Site((rows, cols), circle, own, next(sufficient, None)))
+            sufficient = (number for number in standing if _covers(guesses[number], circle, options))
+            found.append(Site(at, circle, standing, next(sufficient, None)))
     return found
 
 
@@ -109,7 +105,7 @@ def _circle_around(cells: MapCells, rows: NDArray[np.intp], cols: NDArray[np.int
     points = (np.column_stack((cols + frame.col, rows + frame.row)) + 0.5) * frame.resolution
     middle = (points.min(axis=0) + points.max(axis=0)) / 2
     radius = float(np.hypot(*(points - middle).T).max()) + frame.resolution
-    return Primitive(Kind.CIRCLE, *middle.tolist(), None, (radius,))
+    return Primitive(Kind.CIRCLE, float(middle[0]), float(middle[1]), None, (radius,))
 
 
 @dataclass
@@ -171,7 +167,8 @@ def tell_apart(
     _set_backgrounds(pool, trials, beside, options)
     list(pool.map(lambda trial: _cut(trial, beside, sensor), trials))
     for _ in range(options.touching.tries):
-        tried = [trial for trial in trials if trial.partitions and not trial.parts]
+        sure = options.touching.sure_nats
+        tried = [trial for trial in trials if trial.partitions and trial.evidence < trial.alone + sure]
         _fit_parts(pool, tried, beside, sensor, options)
         for trial in tried:
             _judge(trial, beside, sensor)
@@ -304,7 +301,7 @@ def _judge(trial: Trial, beside: Sequence[Candidate], sensor: BeamModel) -> None
     shapes = [part.current for part in parts]
     if is_one_piece(shapes, touching):
         trial.alone = max(trial.alone, evidence + touching.min_nats)
-    elif _overlap(shapes) < touching.max_shared and evidence > trial.alone:
+    elif _overlap(shapes) < touching.max_shared and evidence > max(trial.alone, trial.evidence):
         trial.evidence, trial.parts = evidence, parts
 
 
@@ -314,7 +311,7 @@ def _fits(part: Candidate, present: Sequence[Candidate], sensor: BeamModel) -> b
     bundle = part.rays_with_background(present, sensor)
     ratio = float(-bundle.rays[BACKGROUND].sum() - part.fits[0].cost)
     met = np.count_nonzero(ranges_to(part.current, bundle.rays) < bundle.rays[OCCLUSION])
-    enough = ratio > options.acceptance.min_log_ratio and met > options.touching.min_rays
+    enough = ratio > options.acceptance.min_log_ratio and int(met) > options.touching.min_rays
     return part.outline is None and enough
 
 

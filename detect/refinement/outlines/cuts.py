@@ -145,12 +145,9 @@ def _length_of(vertices: FloatArray) -> float:
 
 
 def _most_like(vertices: FloatArray, options: TouchingOptions) -> tuple[Primitive, float]:
-    """Return the primitive most like a polygon, of those with its centroid and second moments, and the area in m²
-    by which they differ."""
+    """Return the primitive most like a polygon, with its second moments, and the area (m²) by which they differ."""
     part = shapely.Polygon(vertices)
-    made = [
-        primitive_of(kind, p) for guess in _rectangles(vertices) for kind in Kind for p in starts(guess, kind)
-    ]
+    made = [primitive_of(kind, p) for guess in _rectangles(vertices) for kind in Kind for p in starts(guess, kind)]
     outlines = shapely.polygons([shapely.linearrings(one.outline(options.round_vertices)) for one in made])
     shared = shapely.area(shapely.intersection(outlines, part))
     different = shapely.area(outlines) + part.area - 2 * shared

@@ -69,7 +69,11 @@ def _flush_sides(a: Primitive, b: Primitive, options: TouchingOptions) -> FloatA
 
     Of convex polygons that touch the separating line is along a side of one of them.
     """
-    if a.is_round or b.is_round or math.hypot(a.x - b.x, a.y - b.y) > a.bounding_radius + b.bounding_radius + options.gap:
+    if (
+        a.is_round
+        or b.is_round
+        or math.hypot(a.x - b.x, a.y - b.y) > a.bounding_radius + b.bounding_radius + options.gap
+    ):
         return None
     best, found = -math.inf, None
     for one, other in ((a, b), (b, a)):
