@@ -480,7 +480,7 @@ class TouchingOptions:
     """A part has this share of the area at least."""
     max_mismatch: float = 0.16
     """Area by which parts and primitives differ, as a share of the whole: above this a partition is not tried."""
-    max_cuts: int = 12
+    max_cuts: int = 8
     """Cuts that are compared by area: the shortest, for the outline that they cut off."""
     round_vertices: int = 24
     """Vertices that stand for round shapes there."""

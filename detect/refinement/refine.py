@@ -431,7 +431,7 @@ class Refinement:
     def _in_order(
         self, candidates: Sequence[Candidate], results: Mapping[int, RefinedPrimitive | None]
     ) -> list[RefinedPrimitive | None]:
-        """Return the results of all guesses; those told apart have the part most like them, ``further`` the others."""
+        """Return the guesses' results: of what was told apart the part most like each; ``further`` has the rest."""
         numbers = {id(candidate): number for number, candidate in enumerate(candidates)}
         ordered = [results.get(id(candidate)) for candidate in candidates]
         self.further = []

@@ -171,7 +171,7 @@ def tell_apart(
         tried = [trial for trial in trials if trial.partitions and trial.evidence < trial.alone + sure]
         _fit_parts(pool, tried, beside, sensor, options)
         for trial in tried:
-            _judge(trial, beside, sensor)
+            _judge(pool, trial, beside, sensor)
     found = [trial for trial in trials if trial.parts]
     list(pool.map(lambda trial: _hold_against_outlines(trial, beside, sensor), found))
     return [trial for trial in found if trial.parts and trial.evidence > trial.alone]
@@ -280,8 +280,6 @@ def _fit_parts(
         for part in parts if not left else []:
             part.keep_rays(part.bundle.passing(part.current, options.rays.fitted_reach))
         fit_candidates(pool, parts, [left > 0] * len(parts), sensor, beside)
-    if parts:
-        find_misfits(pool, parts, sensor, beside)
 
 
 def _part(guess: Primitive, whole: Candidate, reach: float) -> Candidate:
@@ -292,17 +290,17 @@ def _part(guess: Primitive, whole: Candidate, reach: float) -> Candidate:
     return part
 
 
-def _judge(trial: Trial, beside: Sequence[Candidate], sensor: BeamModel) -> None:
+def _judge(pool: Executor, trial: Trial, beside: Sequence[Candidate], sensor: BeamModel) -> None:
     """Take the parts that were tried where they are likelier than one thing, and each fits a kind."""
     touching, parts = trial.whole.options.touching, trial.tried
-    if not all(_fits(part, [*parts, *beside], sensor) for part in parts):
-        return
-    evidence = log_evidence_of(parts, trial.whole, beside, sensor)
     shapes = [part.current for part in parts]
+    evidence = log_evidence_of(parts, trial.whole, beside, sensor)
     if is_one_piece(shapes, touching):
         trial.alone = max(trial.alone, evidence + touching.min_nats)
-    elif _overlap(shapes) < touching.max_shared and evidence > max(trial.alone, trial.evidence):
-        trial.evidence, trial.parts = evidence, parts
+    elif evidence > max(trial.alone, trial.evidence) and _overlap(shapes) < touching.max_shared:
+        find_misfits(pool, parts, sensor, beside)
+        if all(_fits(part, [*parts, *beside], sensor) for part in parts):
+            trial.evidence, trial.parts = evidence, parts
 
 
 def _fits(part: Candidate, present: Sequence[Candidate], sensor: BeamModel) -> bool:

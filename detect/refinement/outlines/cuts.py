@@ -19,7 +19,7 @@ from detect.refinement.options import DEFAULTS, TouchingOptions
 from prim.arrays import FloatArray
 from prim.shapes import Kind, Primitive
 
-TINY = 1e-9
+EXACT = 1e-9
 """m; cuts this near to an end of an edge end at its vertex, and touch the outline."""
 
 
@@ -74,14 +74,14 @@ class _Cut:
 
 def _shortest_cuts(vertices: FloatArray, whole: shapely.Polygon, options: TouchingOptions) -> list[_Cut]:
     """Return the cuts that lie in the outline, the shortest for the outline on either side of them first."""
-    inner = whole.buffer(TINY)
+    inner = whole.buffer(EXACT)
     found = []
     for cut in _cuts(vertices, options):
         first, length = vertices[cut.vertex], math.hypot(*(cut.end - vertices[cut.vertex]))
-        if length < TINY or not inner.covers(shapely.LineString([first, cut.end])):
+        if length < EXACT or not inner.covers(shapely.LineString([first, cut.end])):
             continue
         around = min(_length_of(part) for part in _split(vertices, cut)) - length
-        found.append((length / max(around, TINY), cut))
+        found.append((length / max(around, EXACT), cut))
     found.sort(key=lambda item: item[0])
     return [cut for _, cut in found[: options.max_cuts]]
 
@@ -113,13 +113,13 @@ def _concave(vertices: FloatArray, options: TouchingOptions) -> list[int]:
 def _shares(vertices: FloatArray, i: int, first: FloatArray, last: FloatArray) -> Iterator[float]:
     """Yield where along an edge, as a share of it, cuts from vertex i meet it: nearest to it, and along its edges."""
     along, at = last - first, vertices[i]
-    nearest = float((at - first) @ along / max(along @ along, TINY**2))
+    nearest = float((at - first) @ along / max(along @ along, EXACT**2))
     if 0 < nearest < 1:
         yield nearest
     for neighbour in (vertices[i - 1], vertices[(i + 1) % len(vertices)]):
         direction = at - neighbour
         across = direction[0] * along[1] - direction[1] * along[0]
-        if abs(across) < TINY**2:
+        if abs(across) < EXACT**2:
             continue
         share = float((direction[1] * (first - at)[0] - direction[0] * (first - at)[1]) / across)
         ahead = float((first + share * along - at) @ direction)
@@ -168,8 +168,9 @@ def _rectangles(vertices: FloatArray) -> list[Primitive]:
     for theta in (principal, math.atan2(longest[1], longest[0])):
         axes = np.array([[math.cos(theta), -math.sin(theta)], [math.sin(theta), math.cos(theta)]])
         variances = np.diag(axes.T @ moments @ axes)
-        width, height = np.sqrt(12 * np.maximum(variances, TINY)).tolist()
-        made.append(Primitive(Kind.RECTANGLE, *centroid.tolist(), theta, (width, height)).canonical())
+        width, height = np.sqrt(12 * np.maximum(variances, EXACT)).tolist()
+        x, y = centroid.tolist()
+        made.append(Primitive(Kind.RECTANGLE, x, y, theta, (width, height)).canonical())
     return made
 
 
