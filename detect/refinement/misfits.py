@@ -27,7 +27,13 @@ def find_misfits(
         beside: Further candidates that may occlude these.
     """
     model = BeamModel.create(
-        sensor.std, sensor.span, candidates[0].options.outline.footprint, 1.0, sensor.max_std, sensor.options
+        sensor.std,
+        sensor.span,
+        candidates[0].options.outline.footprint,
+        1.0,
+        sensor.max_std,
+        sensor.options,
+        sensor.dropout_share,
     )
     present = [*candidates, *beside]
     bundles = [candidate.rays_with_background(present, model) for candidate in candidates]
@@ -69,7 +75,8 @@ def sensor_without_misfits(
         find_misfits(pool, candidates, sensor)
         std = noise_std or estimate_noise(candidates, sensor)
         settled = abs(std - sensor.std) < options.same_noise * std
-        sensor = BeamModel.create(std, sensor.span, sensor.footprint, 1.0, sensor.max_std, options)
+        dropouts = sensor.dropout_share
+        sensor = BeamModel.create(std, sensor.span, sensor.footprint, 1.0, sensor.max_std, options, dropouts)
         if settled:
             break
     return sensor

@@ -38,12 +38,15 @@ class Alternative:
         log_odds: Log Bayes factor against the likeliest kind (nats).
         std: Standard deviation (m) of the outline, across it; the median over its vertices.
         reason: What it is, in words and numbers.
+        is_told: Whether a candidate that it is likelier for than the kinds is told as it; else the kind is told, with
+            the probability that is left.
     """
 
     vertices: FloatArray
     log_odds: float
     std: float
     reason: str
+    is_told: bool = True
 
 
 def free_alternatives(
@@ -60,13 +63,11 @@ def free_alternatives(
     Returns:
         Those that differ from the likeliest kind's outline.
     """
-    evidence = {
-        fit.kind: laplace_evidence(fit, sensor.dispersion, candidate.options.evidence) for fit in candidate.fits
-    }
-    best = max(candidate.fits, key=lambda fit: evidence[fit.kind])
+    rated = [(laplace_evidence(fit, sensor.dispersion, candidate.options.evidence), fit) for fit in candidate.fits]
+    evidence, best = max(rated, key=lambda item: item[0])
     found = [
         _deformed(candidate, best, bundle, sensor),
-        _polygon(candidate, evidence[best.kind], bundle, candidates, sensor),
+        _polygon(candidate, evidence, bundle, candidates, sensor),
     ]
     kind = primitive_of(best.kind, best.p)
     limit = 1 - candidate.options.other.min_difference
@@ -92,7 +93,8 @@ def _polygon(
     """Fit polygons; None where there is nothing to begin with."""
     options = candidate.options.polygon
     others = [other.current for other in candidates if other is not candidate]
-    starts = polygon_starts([primitive_of(fit.kind, fit.p) for fit in candidate.fits], options)
+    likeliest = {fit.kind: fit for fit in reversed(candidate.fits)}
+    starts = polygon_starts([primitive_of(fit.kind, fit.p) for fit in likeliest.values()], options)
     contour = contour_of(candidate.current, candidate.cells, others, candidate.walls, options)
     if contour is not None:
         starts.append(contour)
@@ -131,7 +133,7 @@ def larger_alternatives(
     beside_other = any(are_flush(primitive, other, options.touching) for other in others)
     if beside_other or is_flush(primitive, candidate.cells, options.contact):
         reason = "one side is flush with what is beside it: as likely a part of that"
-        found.append(Alternative(outline, math.log(options.other.flush / len(Kind)), 0.0, reason))
+        found.append(Alternative(outline, math.log(options.other.flush / len(Kind)), 0.0, reason, is_told=False))
     return found
 
 

@@ -37,7 +37,7 @@ from detect.refinement.other import (
     other_log_odds,
     simple_outline,
 )
-from detect.refinement.sensor_estimation import estimate_noise, estimate_sensor, initial_noise
+from detect.refinement.sensor_estimation import estimate_dropouts, estimate_noise, estimate_sensor, initial_noise
 from detect.refinement.surroundings.map_cells import MapCells
 from detect.refinement.surroundings.proposals import propose
 from detect.refinement.touching import Site, Trial, find_sites, tell_apart
@@ -47,9 +47,6 @@ from prim.metrics import overlap_coefficient
 from prim.scan import Scan
 from prim.se2 import Pose2D
 from prim.shapes import Kind, Primitive
-
-MAX_LOG_ODDS = 700.0
-"""Nats beyond which odds are as good as none: the exponential is finite."""
 
 
 @dataclass(frozen=True)
@@ -89,7 +86,7 @@ class RefinedPrimitive:
     @property
     def is_other(self) -> bool:
         """Whether it is likelier none of the kinds than one of them."""
-        return self.alternative is not None and self.other_probability > DEFAULTS.other.majority
+        return self.alternative is not None and self.alternative.is_told and self.other_probability > 0.5
 
     def beside(self, alternatives: Sequence[Alternative], options: OtherOptions) -> RefinedPrimitive:
         """Hold the kinds against alternatives.
@@ -104,7 +101,7 @@ class RefinedPrimitive:
         if not alternatives:
             return self
         likeliest = self.kind_probabilities[self.primitive.kind]
-        probability = 1 / (1 + math.exp(-max(other_log_odds(alternatives, likeliest, options), -MAX_LOG_ODDS)))
+        probability = float(np.exp(-np.logaddexp(0.0, -other_log_odds(alternatives, likeliest, options))))
         best = max(alternatives, key=lambda one: one.log_odds)
         return replace(self, other_probability=probability, alternative=best)
 
@@ -457,14 +454,16 @@ class Refinement:
         """Search, remove duplicates, fit jointly, estimate the sensor, and compare kinds; results by id."""
         options, known_noise = self.options, self.noise_std
         noise = known_noise or min(self.guessed_noise or initial_noise(seen, options.sensor), max_noise)
-        sensor = BeamModel.create(noise, span, max_std=max_noise, options=options.sensor)
         find_backgrounds(pool, seen, self.cells, options.map.cleared_first, options)
+        dropouts = estimate_dropouts(seen, noise, options.sensor)
+        sensor = BeamModel.create(noise, span, max_std=max_noise, options=options.sensor, dropout_share=dropouts)
         fit_candidates(pool, seen, [True] * len(seen), sensor)
         single = self._near_rays(without_duplicates(seen, preferred, sensor))
         if not single:
             return {}
         noise = known_noise or estimate_noise(single, sensor)
-        sensor = BeamModel.create(noise, span, max_std=max_noise, options=options.sensor)
+        dropouts = estimate_dropouts(single, noise, options.sensor)
+        sensor = BeamModel.create(noise, span, max_std=max_noise, options=options.sensor, dropout_share=dropouts)
         self._fit_jointly(pool, single, sensor)
         if not options.closed_world:
             sensor = sensor_without_misfits(pool, single, sensor, known_noise)
@@ -635,7 +634,7 @@ def _compare_with_map(
     if not meets.any():
         return 0.0, 0, 0.0
     met, cells = bundle.select(meets), map_alone.select(meets)
-    own = np.log(surface_likelihood(met, ranges[meets], np.ones(len(met), np.bool_), 0.0, sensor))
+    own = np.log(surface_likelihood(met, ranges[meets], np.ones(len(met), np.bool_), np.zeros(len(met)), sensor))
     free = np.log(surface_likelihood(met, cells.ranges, cells.hits_map, cells.uncertainty, sensor))
     x, y = met.rays[:2] + ranges[meets] * met.rays[2:4] - [[primitive.x], [primitive.y]]
     sector = np.floor(np.arctan2(y, x) / (2 * math.pi) * sectors).astype(int) % sectors

@@ -11,11 +11,22 @@ from numpy.typing import NDArray
 
 from detect.refinement.candidates import Candidate
 from detect.refinement.fitting.evidence import exact_costs
+from detect.refinement.fitting.fit import KindFit
 from detect.refinement.likelihood.geometry import JACOBIANS, NUMBERS, OUTLINES, ranges_to
-from detect.refinement.likelihood.kernels import MEASURED, OCCLUSION, PARAMETERS, RANGE, gradient, upper_tail
+from detect.refinement.likelihood.kernels import (
+    MEASURED,
+    NO_RETURN,
+    OCCLUSION,
+    PARAMETERS,
+    RANGE,
+    RayData,
+    gradient,
+    upper_tail,
+)
 from detect.refinement.likelihood.rays import RayBundle
 from detect.refinement.likelihood.sensor_model import BeamModel, table_nearest
 from detect.refinement.options import DEFAULTS, SensorOptions
+from detect.refinement.outlines.kernels import outline_likelihood
 from prim import linear_algebra
 from prim.arrays import FloatArray
 from prim.normal import NORMAL_MAD
@@ -45,6 +56,56 @@ def _residuals(bundle: RayBundle, primitive: Primitive) -> FloatArray:
     return np.asarray(bundle.rays[RANGE, hit] - ranges[hit])
 
 
+def estimate_dropouts(
+    candidates: Sequence[Candidate], noise_std: float, options: SensorOptions = DEFAULTS.sensor
+) -> float:
+    """Estimate the share of beams that meet a surface and return nothing, robustly.
+
+    It is the median of the candidates' shares, weighted by their rays, among rays that pass well inside the guess, in
+    front of which the map has nothing. A candidate that most rays fly through is none.
+
+    Args:
+        candidates: The candidates, with the map behind them.
+        noise_std: Range noise (m).
+        options: Margins and bounds.
+
+    Returns:
+        The share; 0 where nearly all rays returned.
+    """
+    shares, weights = [], []
+    if not any((candidate.bundle.outcomes == NO_RETURN).any() for candidate in candidates):
+        return 0.0
+    for candidate in candidates:
+        bundle, background = candidate.bundle, candidate.background
+        assert background is not None
+        within = ranges_to(candidate.current, bundle.rays) < bundle.max_range - options.max_residual * noise_std
+        within &= bundle.passing(candidate.current, -options.footprints[-1]) & ~background.blocked
+        count = int(np.count_nonzero(within))
+        share = int(np.count_nonzero(bundle.outcomes[within] == NO_RETURN)) / max(count, 1)
+        if share <= options.max_dropout_share:
+            shares.append(share)
+            weights.append(count)
+    median = weighted_median(np.array(shares), np.array(weights))
+    return median if median >= options.min_dropout_share else 0.0
+
+
+def weighted_median(values: FloatArray, weights: NDArray[np.int64]) -> float:
+    """Return the weighted median: the least value that half of the weight does not exceed.
+
+    Args:
+        values: (N,).
+        weights: (N,), 0 or more.
+
+    Returns:
+        The median; 0 where nothing has a weight.
+    """
+    if not weights.any():
+        return 0.0
+    order = np.argsort(values, kind="stable")
+    total = np.cumsum(weights[order])
+    return float(values[order][np.searchsorted(total, total[-1] / 2)])
+
+
 def estimate_sensor(candidates: Sequence[Candidate], sensor: BeamModel, noise_std: float | None) -> BeamModel:
     """Estimate noise, footprint and dispersion from all candidates together.
 
@@ -60,13 +121,14 @@ def estimate_sensor(candidates: Sequence[Candidate], sensor: BeamModel, noise_st
         The sensor.
     """
     std = noise_std or estimate_noise(candidates, sensor)
-    sensor = BeamModel.create(std, sensor.span, sensor.footprint, 1.0, sensor.max_std, sensor.options)
+    span, max_std, options, dropouts = sensor.span, sensor.max_std, sensor.options, sensor.dropout_share
+    sensor = BeamModel.create(std, span, sensor.footprint, 1.0, max_std, options, dropouts)
     footprint = estimate_footprint(candidates, sensor)
     dispersion = scan_dispersion(candidates, sensor)
-    if footprint > 0 or dispersion > sensor.options.significant_dispersion:
+    if footprint > 0 or dispersion > options.significant_dispersion:
         with_footprint = replace(sensor, footprint=footprint)
         dispersion = max(dispersion, clustered_dispersion(candidates, with_footprint))
-    return BeamModel.create(std, sensor.span, footprint, dispersion, sensor.max_std, sensor.options)
+    return BeamModel.create(std, span, footprint, dispersion, max_std, options, dropouts)
 
 
 def _without_outlines(candidates: Sequence[Candidate]) -> list[Candidate]:
@@ -162,9 +224,8 @@ def clustered_dispersion(candidates: Sequence[Candidate], sensor: BeamModel) -> 
         1 or more.
     """
     options = sensor.options
-    fitting = _without_outlines(candidates)
-    bundles = [candidate.rays_with_background(candidates, sensor) for candidate in fitting]
-    pairs = zip(fitting, bundles, strict=True)
+    bundles = [candidate.rays_with_background(candidates, sensor) for candidate in candidates]
+    pairs = zip(candidates, bundles, strict=True)
     scores = [score for pair in pairs if (score := _scan_scores(*pair, sensor)) is not None]
     largest = 1.0
     for length in options.stretches:
@@ -189,23 +250,47 @@ def clustered_dispersion(candidates: Sequence[Candidate], sensor: BeamModel) -> 
 def _scan_scores(candidate: Candidate, bundle: RayBundle, sensor: BeamModel) -> FloatArray | None:
     """Return the whitened score (S, K) of each scan's rays by a candidate's own parameters.
 
-    Independent rays give each a mean square of 1 / S. None where the information is singular.
+    Of a free outline it is that by its place. Independent rays give each a mean square of 1 / S. None where the
+    information is singular.
     """
-    fit = candidate.fits[0]
-    jacobian, blur = JACOBIANS[fit.kind], max(sensor.footprint, sensor.options.min_score_blur)
-
-    def score_and_information(part: RayBundle) -> tuple[FloatArray, FloatArray]:
-        slope, information = np.zeros(PARAMETERS), np.zeros((PARAMETERS, PARAMETERS))
-        gradient(OUTLINES, NUMBERS[fit.kind], fit.p, sensor.data(part), blur, slope, information)
-        return jacobian.T @ slope, jacobian.T @ information @ jacobian
-
-    lower = linear_algebra.cholesky(score_and_information(bundle)[1])
+    blur = max(sensor.footprint, sensor.options.min_score_blur)
+    outline = candidate.outline
+    score_of = _score_by_parameters(candidate.fits[0]) if outline is None else _score_by_place(outline)
+    lower = linear_algebra.cholesky(score_of(sensor.data(bundle), blur)[1])
     whiten = None if lower is None else linear_algebra.inverse(lower)
     if whiten is None:
         return None
     scans, number = np.unique(bundle.scan, return_inverse=True)
     parts = (bundle.select(number == k) for k in range(len(scans)))
-    return np.array([whiten @ score_and_information(part)[0] for part in parts])
+    return np.array([whiten @ score_of(sensor.data(part), blur)[0] for part in parts])
+
+
+Score = Callable[[RayData, float], tuple[FloatArray, FloatArray]]
+"""A function of rays and a blur (m): score (K,) and information (K, K)."""
+
+
+def _score_by_parameters(fit: KindFit) -> Score:
+    """Return the score of rays by a kind's own parameters."""
+    jacobian = JACOBIANS[fit.kind]
+
+    def score(data: RayData, blur: float) -> tuple[FloatArray, FloatArray]:
+        slope, information = np.zeros(PARAMETERS), np.zeros((PARAMETERS, PARAMETERS))
+        gradient(OUTLINES, NUMBERS[fit.kind], fit.p, data, blur, slope, information)
+        return jacobian.T @ slope, jacobian.T @ information @ jacobian
+
+    return score
+
+
+def _score_by_place(outline: FloatArray) -> Score:
+    """Return the score of rays by the place of an outline (V, 2): the sum of those by its vertices."""
+
+    def score(data: RayData, blur: float) -> tuple[FloatArray, FloatArray]:
+        slope, information = np.zeros(outline.size), np.zeros((outline.size, outline.size))
+        outline_likelihood(outline, data, blur, slope, information)
+        count = len(outline)
+        return slope.reshape(count, 2).sum(axis=0), information.reshape(count, 2, count, 2).sum(axis=(0, 2))
+
+    return score
 
 
 def _without_truncation(error: FloatArray, cut: FloatArray) -> FloatArray:
@@ -247,7 +332,7 @@ def maximum_likelihood_noise(
 
     def cost(log_std: float) -> float:
         std = math.exp(log_std)
-        table = BeamModel.create(std, sensor.span, options=sensor.options).table
+        table = BeamModel.create(std, sensor.span, options=sensor.options, dropout_share=sensor.dropout_share).table
         return count * log_std - float(table_nearest(table, outcomes, (ranges - z) / std).sum())
 
     std = math.exp(_minimize(cost, math.log(sensor.std), sensor.options))

@@ -24,6 +24,7 @@ from detect.refinement.likelihood.kernels import BACKGROUND
 from detect.refinement.likelihood.rays import collect_rays
 from detect.refinement.likelihood.sensor_model import BeamModel
 from detect.refinement.options import DEFAULTS, RefinementOptions, StandingOptions
+from detect.refinement.sensor_estimation import estimate_dropouts
 from detect.refinement.surroundings.map_cells import MapCells
 from prim.scan import Scan
 from prim.se2 import Pose2D
@@ -89,9 +90,10 @@ def judge_places(
         Candidate(detection.primitive, bundle, cells, detection, options)
         for detection, bundle in zip(detections, bundles, strict=True)
     ]
-    sensor = BeamModel.create(noise_std, span or 1.0, max_std=max_noise, options=options.sensor)
     with ThreadPoolExecutor(threads) as pool:
         find_backgrounds(pool, candidates, cells, options.map.cleared, options)
+        dropouts = estimate_dropouts(candidates, noise_std, options.sensor)
+        sensor = BeamModel.create(noise_std, span or 1.0, 0.0, 1.0, max_noise, options.sensor, dropouts)
         return list(pool.map(lambda candidate: _judge(candidate, candidates, sensor, slack), candidates))
 
 

@@ -201,6 +201,9 @@ def _touching_cells(
     for straight in cells.walls:
         if not straight.hides(outline, depth, 0.0):
             unexplained &= ~straight.contains(points, width, options.wall_extension)
+    for straight in cells.thin_walls:
+        if straight.is_beside(outline, depth):
+            unexplained &= ~straight.contains(points, width, options.wall_extension)
     at_edge, touch, inside = (
         is_within(primitive, points, margin)
         for margin in (options.edge * resolution, options.touch * resolution, 0.0)
