@@ -191,22 +191,7 @@ def scan_dispersion(candidates: Sequence[Candidate], sensor: BeamModel) -> float
         if many.any():
             found.append(float((total[many] ** 2 / count[many]).mean()))
             scans.append(int(np.count_nonzero(many)))
-    return max(weighted_median(found, scans), 1.0) if sum(scans) >= options.min_rays else 1.0
-
-
-def weighted_median(values: Sequence[float], weights: Sequence[float]) -> float:
-    """Return the weighted median: the mean of the values around half of the weight.
-
-    Args:
-        values: (N,), one at least.
-        weights: (N,), positive.
-
-    Returns:
-        The median, by linear interpolation between the values at their weights' middles.
-    """
-    order = np.argsort(values)
-    weight = np.asarray(weights, dtype=np.float64)[order]
-    return float(np.interp(weight.sum() / 2, np.cumsum(weight) - weight / 2, np.asarray(values)[order]))
+    return max(weighted_median(np.array(found), np.array(scans)), 1.0) if sum(scans) >= options.min_rays else 1.0
 
 
 def clustered_dispersion(candidates: Sequence[Candidate], sensor: BeamModel) -> float:
@@ -241,7 +226,7 @@ def clustered_dispersion(candidates: Sequence[Candidate], sensor: BeamModel) -> 
             freedom.append(sums.size)
         if not freedom:
             continue
-        found = weighted_median(ratios, freedom)
+        found = weighted_median(np.array(ratios), np.array(freedom))
         if found > 1 + options.significance * math.sqrt(2 / sum(freedom)):
             largest = max(largest, found)
     return largest
