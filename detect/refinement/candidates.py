@@ -157,7 +157,11 @@ class Candidate:
 
 
 def fit_candidates(
-    pool: Executor, candidates: Sequence[Candidate], search: Sequence[bool], sensor: BeamModel
+    pool: Executor,
+    candidates: Sequence[Candidate],
+    search: Sequence[bool],
+    sensor: BeamModel,
+    beside: Sequence[Candidate] = (),
 ) -> None:
     """Fit all candidates in parallel, each beside what was known of the others before.
 
@@ -168,8 +172,10 @@ def fit_candidates(
         candidates: The candidates.
         search: For each whether all kinds are fitted from new starts, or from the fits that there are.
         sensor: The sensor.
+        beside: Further candidates that may occlude these, and stay as they are.
     """
-    bundles = [candidate.rays_with_background(candidates, sensor) for candidate in candidates]
+    present = [*candidates, *beside]
+    bundles = [candidate.rays_with_background(present, sensor) for candidate in candidates]
     work = zip(candidates, bundles, search, strict=True)
     list(pool.map(lambda item: _fit_candidate(item[0], item[1], item[2], sensor), work))
 

@@ -14,7 +14,9 @@ from detect.refinement.sensor_estimation import estimate_noise
 from prim.arrays import FloatArray
 
 
-def find_misfits(pool: Executor, candidates: Sequence[Candidate], sensor: BeamModel) -> None:
+def find_misfits(
+    pool: Executor, candidates: Sequence[Candidate], sensor: BeamModel, beside: Sequence[Candidate] = ()
+) -> None:
     """Give a free outline to each candidate whose rays say that no kind fits.
 
     Candidates whose kind is known already are left as they are.
@@ -23,9 +25,11 @@ def find_misfits(pool: Executor, candidates: Sequence[Candidate], sensor: BeamMo
         pool: The threads.
         candidates: The fitted candidates; ``outline`` is set.
         sensor: The sensor so far; its footprint and dispersion are not used, since misfits may have spoilt them.
+        beside: Further candidates that may occlude these.
     """
     model = replace(sensor, footprint=candidates[0].options.outline.footprint, dispersion=1.0)
-    bundles = [candidate.rays_with_background(candidates, model) for candidate in candidates]
+    present = [*candidates, *beside]
+    bundles = [candidate.rays_with_background(present, model) for candidate in candidates]
     work = zip(candidates, bundles, strict=True)
     found = pool.map(lambda item: _better_outline(item[0], item[1], model), work)
     for candidate, outline in zip(candidates, found, strict=True):

@@ -584,6 +584,53 @@ class OtherOptions:
 
 
 @dataclass(frozen=True)
+class TouchingOptions:
+    """When what no kind fits is told apart into two things that touch."""
+
+    around: float = 1.5
+    """cells; a component of the map belongs to a candidate where its cells are this near to it."""
+    max_radius: float = 0.7
+    """m; of the circle around a component; larger ones are no two primitives: EvidenceOptions.max_extent."""
+    reach: float = 0.03
+    """m; rays that pass that circle at this distance are needed."""
+    unexplained: float = 0.25
+    """Share of a component's cells that no candidate covers, above which two things are tried although each
+    candidate fits a kind."""
+    simplification: float = 0.7
+    """cells; tolerance of one of the contours that are cut: a neck may be a cell deep."""
+    min_turn: float = 0.25
+    """rad; an outline is concave where it turns inwards by more."""
+    min_share: float = 0.06
+    """A part has this share of the area at least."""
+    max_mismatch: float = 0.16
+    """Area by which parts and primitives differ, as a share of the whole: above this a partition is not tried."""
+    max_cuts: int = 8
+    """Cuts that are compared by area: the shortest, for the outline that they cut off."""
+    round_vertices: int = 24
+    """Vertices that stand for round shapes there."""
+    tries: int = 3
+    """Partitions that are fitted to the rays, those whose parts are most like primitives,"""
+    alike: float = 0.8
+    """leaving out those whose parts have more than this in common (IoU) with another's."""
+    rounds: int = 3
+    """Fits of the parts beside each other; all but the last are searches."""
+    min_rays: int = 40
+    """Rays that meet each part."""
+    min_nats: float = 15.0
+    """nats; by which one thing is likelier a priori than two that touch, and that are tried in several ways."""
+    sure_nats: float = 100.0
+    """nats; parts that are likelier than one thing by more are not tried otherwise."""
+    max_shared: float = 0.06
+    """Share of the smaller area that parts have in common at most: things do not overlap."""
+    aligned: float = 0.03
+    """rad; sides that differ by less in direction are parallel."""
+    coincidence: float = 0.004
+    """m; lines, or axes, that are no further apart are the same."""
+    gap: float = 0.006
+    """m; parts that are further apart do not touch."""
+
+
+@dataclass(frozen=True)
 class StandingOptions:
     """When the rays of some scans contradict a fit to those of others."""
 
@@ -615,6 +662,7 @@ class RefinementOptions:
     polygon: PolygonOptions = field(default_factory=PolygonOptions)
     contact: ContactOptions = field(default_factory=ContactOptions)
     other: OtherOptions = field(default_factory=OtherOptions)
+    touching: TouchingOptions = field(default_factory=TouchingOptions)
     standing: StandingOptions = field(default_factory=StandingOptions)
     closed_world: bool = False
     """Whether all there is are the kinds and walls: nothing is held against «none of the kinds»."""

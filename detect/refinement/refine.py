@@ -42,6 +42,7 @@ from detect.refinement.scanner_errors import correct_scanner_errors, settle_scan
 from detect.refinement.sensor_estimation import estimate_dropouts, estimate_noise, estimate_sensor, initial_noise
 from detect.refinement.surroundings.map_cells import MapCells
 from detect.refinement.surroundings.proposals import propose
+from detect.refinement.touching import Site, Trial, find_sites, tell_apart
 from mapping.grid import OccupancyGrid
 from prim.arrays import FloatArray
 from prim.metrics import overlap_coefficient
@@ -181,7 +182,9 @@ def refine_detections(
     kept: list[Detection] = []
     objects: list[UnknownObject] = []
     rejected = []
-    for number, (guess, result) in enumerate(zip(wanted, refined, strict=True)):
+    results = [*enumerate(refined), *refinement.further]
+    for number, result in results:
+        guess = wanted[number]
         if number < found:
             reason = rejection_reason(result, options.acceptance)
         else:
@@ -365,6 +368,8 @@ class Refinement:
         rounds: Joint fits once duplicates are gone; None: as in the options.
         options: Numeric parameters.
         sensor: Errors of the scanner that :meth:`run` found and corrected; None where it found none.
+        further: Of things that were told apart by :meth:`run`, those beyond the guesses: with the index of the guess
+            that they were a part of.
     """
 
     cells: MapCells
@@ -374,6 +379,8 @@ class Refinement:
     rounds: int | None = None
     options: RefinementOptions = field(default_factory=RefinementOptions)
     sensor: SensorErrors | None = None
+    further: list[tuple[int, RefinedPrimitive]] = field(default_factory=list)
+    _told_apart: list[Trial] = field(default_factory=list)
 
     def run(
         self,
@@ -399,21 +406,54 @@ class Refinement:
         """
         if not primitives:
             return []
-        bundles, span, max_noise = collect_rays(scans, primitives, self.options.rays.reach, self.options, since)
+        sites = [] if self.options.closed_world else find_sites(self.cells, primitives, self.options)
+        alone = [site for site in sites if site.covered_by is None]
+        circles = [site.circle for site in alone]
+        stamps = list(since or [None] * len(primitives))
+        stamps += [stamps[site.members[0]] for site in alone]
+        reach = self.options.rays.reach
+        bundles, span, max_noise = collect_rays(scans, [*primitives, *circles], reach, self.options, stamps)
+        for site, bundle in zip(alone, bundles[len(primitives) :], strict=True):
+            site.bundle = bundle
         detections = known or {}
         candidates = [
             Candidate(start, bundle, self.cells, detections.get(number), self.options)
-            for number, (start, bundle) in enumerate(zip(primitives, bundles, strict=True))
+            for number, (start, bundle) in enumerate(zip(primitives, bundles, strict=False))
         ]
+        for site in sites:
+            site.take(candidates)
         seen = [candidate for candidate in candidates if len(candidate.bundle)]
         results: dict[int, RefinedPrimitive | None] = {}
         if seen:
             with ThreadPoolExecutor(self.threads) as pool:
-                results = self._refine(pool, seen, candidates[:preferred], span, max_noise)
-        return [results.get(id(candidate)) for candidate in candidates]
+                results = self._refine(pool, seen, candidates[:preferred], sites, span, max_noise)
+        return self._in_order(candidates, results)
+
+    def _in_order(
+        self, candidates: Sequence[Candidate], results: Mapping[int, RefinedPrimitive | None]
+    ) -> list[RefinedPrimitive | None]:
+        """Return the guesses' results: of what was told apart the part most like each; ``further`` has the rest."""
+        numbers = {id(candidate): number for number, candidate in enumerate(candidates)}
+        ordered = [results.get(id(candidate)) for candidate in candidates]
+        self.further = []
+        for trial in self._told_apart:
+            left = list(trial.parts)
+            for guess in trial.site.candidates[: len(left)]:
+                best = max(left, key=lambda part: overlap_coefficient(part.current, guess.start))
+                left.remove(best)
+                ordered[numbers[id(guess)]] = results.get(id(best))
+            first = numbers[id(trial.site.candidates[0])]
+            self.further += [(first, result) for part in left if (result := results.get(id(part)))]
+        return ordered
 
     def _refine(
-        self, pool: Executor, seen: list[Candidate], preferred: list[Candidate], span: float, max_noise: float
+        self,
+        pool: Executor,
+        seen: list[Candidate],
+        preferred: list[Candidate],
+        sites: Sequence[Site],
+        span: float,
+        max_noise: float,
     ) -> dict[int, RefinedPrimitive | None]:
         """Search, remove duplicates, fit jointly, estimate the sensor, and compare kinds; results by id."""
         options, known_noise = self.options, self.noise_std
@@ -429,7 +469,7 @@ class Refinement:
         dropouts = estimate_dropouts(single, noise, options.sensor)
         sensor = BeamModel.create(noise, span, max_std=max_noise, options=options.sensor, dropout_share=dropouts)
         self._fit_jointly(pool, single, sensor)
-        sensor = self._find_sensor(pool, single, sensor, known_noise)
+        single, sensor = self._find_sensor(pool, sites, single, sensor)
         disperses = sensor.dispersion > options.sensor.significant_dispersion
         fit_candidates(pool, single, [disperses] * len(single), sensor)
         self.noise_std = sensor.std
@@ -439,17 +479,35 @@ class Refinement:
         return results if options.closed_world else self._beside_others(pool, single, results, sensor)
 
     def _find_sensor(
-        self, pool: Executor, candidates: list[Candidate], sensor: BeamModel, noise_std: float | None
-    ) -> BeamModel:
-        """Estimate the sensor by the candidates that a kind fits, once its errors are taken out of all rays."""
+        self, pool: Executor, sites: Sequence[Site], candidates: list[Candidate], sensor: BeamModel
+    ) -> tuple[list[Candidate], BeamModel]:
+        """Estimate the sensor by the candidates that a kind fits, once its errors are taken out of all rays.
+
+        What fits no kind is told apart on the way, where it is two things that do.
+        """
+        noise_std = self.noise_std
         sensor = correct_scanner_errors(pool, candidates, sensor, noise_std)
         is_corrected = candidates[0].errors != NO_ERRORS
         if not self.options.closed_world:
             sensor = sensor_without_misfits(pool, candidates, sensor, noise_std)
+            candidates, sensor = self._tell_apart(pool, sites, candidates, sensor)
         sensor, self.sensor = settle_scanner_errors(pool, candidates, sensor, noise_std)
         if is_corrected and self.sensor is None and not self.options.closed_world:
             sensor = sensor_without_misfits(pool, candidates, sensor, noise_std)  # with all errors back
-        return estimate_sensor(candidates, sensor, noise_std)
+        return candidates, estimate_sensor(candidates, sensor, noise_std)
+
+    def _tell_apart(
+        self, pool: Executor, sites: Sequence[Site], candidates: list[Candidate], sensor: BeamModel
+    ) -> tuple[list[Candidate], BeamModel]:
+        """Put two candidates where one fits no kind and two do; with them the sensor is estimated anew."""
+        self._told_apart = tell_apart(pool, sites, candidates, sensor)
+        if not self._told_apart:
+            return candidates, sensor
+        replaced = {id(candidate) for trial in self._told_apart for candidate in trial.before}
+        parts = [part for trial in self._told_apart for part in trial.parts]
+        present = [*(candidate for candidate in candidates if id(candidate) not in replaced), *parts]
+        self._fit_jointly(pool, present, sensor)
+        return present, sensor_without_misfits(pool, present, sensor, self.noise_std)
 
     def _beside_others(
         self,
@@ -473,11 +531,17 @@ class Refinement:
 
         def larger(one: Candidate) -> list[Alternative]:
             others = [primitive for key, primitive in kept.items() if key != id(one)]
+            others += [part.current for part in self._parts_beside(one) if id(part) not in kept]
             return larger_alternatives(one, kept[id(one)], others, sensor)
 
         for one, parts in zip(rest, pool.map(larger, rest), strict=True):
             beside[id(one)] = _required(results[id(one)]).beside([*shapes[id(one)], *parts], other)
         return beside
+
+    def _parts_beside(self, candidate: Candidate) -> list[Candidate]:
+        """Return the other parts of what a candidate was told apart from."""
+        trials = [trial for trial in self._told_apart if candidate in trial.parts]
+        return [part for trial in trials for part in trial.parts if part is not candidate]
 
     def _near_rays(self, candidates: list[Candidate]) -> list[Candidate]:
         """Leave out rays that pass far from the fits, and candidates without any."""
