@@ -483,17 +483,18 @@ class Refinement:
     ) -> tuple[list[Candidate], BeamModel]:
         """Estimate the sensor by the candidates that a kind fits, once its errors are taken out of all rays.
 
-        What fits no kind is told apart on the way, where it is two things that do.
+        What fits no kind is told apart then, where it is two things that do.
         """
         noise_std = self.noise_std
         sensor = correct_scanner_errors(pool, candidates, sensor, noise_std)
         is_corrected = candidates[0].errors != NO_ERRORS
         if not self.options.closed_world:
             sensor = sensor_without_misfits(pool, candidates, sensor, noise_std)
-            candidates, sensor = self._tell_apart(pool, sites, candidates, sensor)
         sensor, self.sensor = settle_scanner_errors(pool, candidates, sensor, noise_std)
         if is_corrected and self.sensor is None and not self.options.closed_world:
             sensor = sensor_without_misfits(pool, candidates, sensor, noise_std)  # with all errors back
+        if not self.options.closed_world:
+            candidates, sensor = self._tell_apart(pool, sites, candidates, sensor)
         return candidates, estimate_sensor(candidates, sensor, noise_std)
 
     def _tell_apart(
