@@ -602,7 +602,7 @@ class TouchingOptions:
     """rad; an outline is concave where it turns inwards by more."""
     min_share: float = 0.06
     """A part has this share of the area at least."""
-    max_mismatch: float = 0.16
+    max_mismatch: float = 0.14
     """Area by which parts and primitives differ, as a share of the whole: above this a partition is not tried."""
     max_cuts: int = 8
     """Cuts that are compared by area: the shortest, for the outline that they cut off."""
@@ -616,17 +616,17 @@ class TouchingOptions:
     """Fits of the parts beside each other; all but the last are searches."""
     min_rays: int = 40
     """Rays that meet each part."""
-    min_nats: float = 15.0
+    min_nats: float = 20.0
     """nats; by which one thing is likelier a priori than two that touch, and that are tried in several ways."""
     sure_nats: float = 100.0
     """nats; parts that are likelier than one thing by more are not tried otherwise."""
     max_shared: float = 0.06
     """Share of the smaller area that parts have in common at most: things do not overlap."""
-    aligned: float = 0.03
+    aligned: float = 0.05
     """rad; sides that differ by less in direction are parallel."""
     coincidence: float = 0.004
     """m; lines, or axes, that are no further apart are the same."""
-    gap: float = 0.006
+    gap: float = 0.02
     """m; parts that are further apart do not touch."""
 
 
