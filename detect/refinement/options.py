@@ -386,6 +386,38 @@ class PolygonOptions:
 
 
 @dataclass(frozen=True)
+class TemplateOptions:
+    """Shapes of few parameters that are none of the kinds."""
+
+    search_rays: int = 1000
+    """Rays that starts are compared with, about."""
+    screen: float = 60.0
+    """nats; starts that are less likely than the kind by more, at the first blur, are left out."""
+    coarse: Descent = Descent((0.012,), 4, 0.5)
+    """From the others."""
+    margin: float = 6.0
+    """nats; templates whose predicted evidence is less than the kind's by more are left out."""
+    fitted: int = 4
+    """Templates that are fitted to all rays at most, those of the largest predicted evidence."""
+    fine: Descent = Descent((0.012, 0.004, 0.001), 8, 0.1)
+    """To all rays."""
+    least_blur: float = 0.0005
+    """m; of silhouettes."""
+    information_blur: float = 0.001
+    """m; as FitOptions.information_blur."""
+    min_size: float = 0.02
+    """m; as FitOptions.min_size."""
+    max_log_odds: float = 6.0
+    """nats; bound of the logarithm of a share's odds: shares beyond 0.25 % and 99.75 % are as good as none and all."""
+    first_damping: float = 1e-2
+    """As those of FitOptions."""
+    min_damping: float = 1e-6
+    max_damping: float = 1e4
+    damping_after_success: float = 0.2
+    damping_after_failure: float = 8.0
+
+
+@dataclass(frozen=True)
 class ContactOptions:
     """When a candidate is a part of something larger."""
 
@@ -485,6 +517,7 @@ class RefinementOptions:
     acceptance: AcceptanceOptions = field(default_factory=AcceptanceOptions)
     outline: OutlineOptions = field(default_factory=OutlineOptions)
     polygon: PolygonOptions = field(default_factory=PolygonOptions)
+    templates: TemplateOptions = field(default_factory=TemplateOptions)
     contact: ContactOptions = field(default_factory=ContactOptions)
     other: OtherOptions = field(default_factory=OtherOptions)
     standing: StandingOptions = field(default_factory=StandingOptions)

@@ -1,0 +1,474 @@
+"""Shapes of few parameters that are none of the kinds: L, U, T, cross, star, half disc, stadium and others.
+
+Where the noise is large, rays do not pay for a free outline's many parameters. A template is a unit outline that a
+few shares shape, stretched by width and height, turned and moved as the kinds' are, with priors as theirs: positions
+flat, sizes uniform up to the same extent, angles uniform, shares uniform from 0 to 1. All templates are equally
+likely a priori. A descent has the logarithms of the odds of shares for parameters, which have no bounds.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+
+from detect.refinement.likelihood.kernels import RayData
+from detect.refinement.likelihood.rays import RayBundle
+from detect.refinement.likelihood.sensor_model import BeamModel
+from detect.refinement.options import DEFAULTS, Descent, TemplateOptions
+from detect.refinement.outlines.kernels import outline_likelihood
+from detect.refinement.outlines.polygons import std_across
+from prim import linear_algebra
+from prim.arrays import FloatArray
+from prim.shapes import Primitive
+
+NO_GRADIENT = np.zeros(0)
+NO_INFORMATION = np.zeros((0, 0))
+
+POSE = 3
+"""Parameters before the sizes: x, y (m), theta (rad)."""
+
+DIFFERENCE = 1e-4
+"""The step of a share, as a part of what is left to 1, that its derivative is taken over."""
+
+Shaped = Callable[..., Sequence[tuple[float, float]]]
+"""From shares to the vertices of a unit outline, counter-clockwise."""
+
+
+def _ell(width: float, height: float) -> list[tuple[float, float]]:
+    x, y = 0.5 - width, 0.5 - height
+    return [(-0.5, -0.5), (0.5, -0.5), (0.5, y), (x, y), (x, 0.5), (-0.5, 0.5)]
+
+
+def _notched(width: float, depth: float, place: float) -> list[tuple[float, float]]:
+    left, y = (1 - width) * place - 0.5, 0.5 - depth
+    right = left + width
+    return [(-0.5, -0.5), (0.5, -0.5), (0.5, 0.5), (right, 0.5), (right, y), (left, y), (left, 0.5), (-0.5, 0.5)]
+
+
+def _u(width: float, depth: float) -> list[tuple[float, float]]:
+    return _notched(width, depth, 0.5)
+
+
+def _tee(stem: float, bar: float) -> list[tuple[float, float]]:
+    x, y = stem / 2, 0.5 - bar
+    return [(-x, -0.5), (x, -0.5), (x, y), (0.5, y), (0.5, 0.5), (-0.5, 0.5), (-0.5, y), (-x, y)]
+
+
+def _cross(width: float, height: float) -> list[tuple[float, float]]:
+    x, y = width / 2, height / 2
+    right = [(x, -0.5), (x, -y), (0.5, -y), (0.5, y), (x, y), (x, 0.5)]
+    return right + [(-a, -b) for a, b in right]
+
+
+def _even_cross(arm: float) -> list[tuple[float, float]]:
+    return _cross(arm, arm)
+
+
+def _arc(first: float, last: float, points: int, radius: float = 0.5) -> list[tuple[float, float]]:
+    return [(radius * math.cos(t), radius * math.sin(t)) for t in np.linspace(first, last, points).tolist()]
+
+
+def _half_disc() -> list[tuple[float, float]]:
+    return [(x, y - 0.25) for x, y in _arc(0, math.pi, 24)]
+
+
+def _half_ellipse() -> list[tuple[float, float]]:
+    return [(x, 2 * y - 0.5) for x, y in _arc(0, math.pi, 24)]
+
+
+def _stadium(end: float) -> list[tuple[float, float]]:
+    right = [(0.5 - end / 2 + end * x, y) for x, y in _arc(-math.pi / 2, math.pi / 2, 12)]
+    return right + [(-x, -y) for x, y in right]
+
+
+def _trapezoid(top: float) -> list[tuple[float, float]]:
+    return [(-0.5, -0.5), (0.5, -0.5), (top / 2, 0.5), (-top / 2, 0.5)]
+
+
+def _parallelogram(shear: float) -> list[tuple[float, float]]:
+    offset = 2 * shear - 1
+    x = (1 - abs(offset)) / 2
+    return [(-x - offset / 2, -0.5), (x - offset / 2, -0.5), (x + offset / 2, 0.5), (-x + offset / 2, 0.5)]
+
+
+def _kite(waist: float) -> list[tuple[float, float]]:
+    return [(0.0, -0.5), (0.5, waist - 0.5), (0.0, 0.5), (-0.5, waist - 0.5)]
+
+
+def _arrow(depth: float) -> list[tuple[float, float]]:
+    return [(-0.5, -0.5), (0.0, depth - 0.5), (0.5, -0.5), (0.0, 0.5)]
+
+
+def _scalene(apex: float) -> list[tuple[float, float]]:
+    return [(-0.5, -0.5), (0.5, -0.5), (apex - 0.5, 0.5)]
+
+
+def _ring(thickness: float, opening: float) -> list[tuple[float, float]]:
+    half, inner = math.pi * opening, 0.5 * (1 - thickness)
+    return _arc(-half, half, 20) + _arc(half, -half, 16, inner)
+
+
+def _regular(corners: int) -> Shaped:
+    return lambda: _arc(0, 2 * math.pi * (1 - 1 / corners), corners)
+
+
+def _star(points: int) -> Shaped:
+    def outline(inner: float) -> list[tuple[float, float]]:
+        turn = math.pi / points
+        return [
+            (0.5 * r * math.cos(n * turn), 0.5 * r * math.sin(n * turn))
+            for n in range(2 * points)
+            for r in [inner if n % 2 else 1.0]
+        ]
+
+    return outline
+
+
+@dataclass(frozen=True)
+class Start:
+    """Where fits of a template begin, in the frame of a fitted kind.
+
+    Attributes:
+        corners: How many that kind has; none where it is round.
+        shares: The template's shares.
+        turns: Angles (rad) from the kind's.
+        boxed: Whether both have the same bounding box; else the same centroid and second moments of area.
+    """
+
+    corners: int
+    shares: tuple[float, ...]
+    turns: tuple[float, ...]
+    boxed: bool = False
+
+
+def _turns(count: int, over: float = 2 * math.pi) -> tuple[float, ...]:
+    return tuple(over * n / count for n in range(count))
+
+
+@dataclass(frozen=True)
+class Template:
+    """A family of shapes.
+
+    Attributes:
+        name: What it is, for reasons.
+        outline: From shares to the unit outline in a box from -1/2 to 1/2, counter-clockwise.
+        starts: Where fits begin.
+        names: How many turns of the parameters' angle give the same shape (both sizes exchanged, too).
+        tied: Whether width and height are one and the same size.
+    """
+
+    name: str
+    outline: Shaped
+    starts: tuple[Start, ...]
+    names: int = 1
+    tied: bool = False
+
+    @property
+    def shares(self) -> int:
+        """How many shares it has."""
+        return len(self.starts[0].shares)
+
+    @property
+    def rigid(self) -> int:
+        """How many parameters place and stretch it."""
+        return POSE + (1 if self.tied else 2)
+
+    @property
+    def parameters(self) -> int:
+        """How many parameters it has in all."""
+        return self.rigid + self.shares
+
+    def unit(self, shares: FloatArray) -> FloatArray:
+        """Return the unit outline (V, 2) of some shares."""
+        return np.array(self.outline(*shares.tolist()))
+
+    def log_prior(self, max_extent: float) -> float:
+        """Return the log prior density (nats; rad, m, shares) without that of the position."""
+        return math.log(self.names / (2 * math.pi)) - (self.rigid - POSE) * math.log(max_extent)
+
+    def vertices(self, q: FloatArray) -> FloatArray:
+        """Return the vertices (V, 2) in m of parameters (K,): x, y, theta, sizes (m), log odds of shares."""
+        unit = self.unit(_shares(q[self.rigid :]))
+        return np.asarray((unit * [q[POSE], q[self.rigid - 1]]) @ _turned(float(q[2])) + q[:2])
+
+    def jacobian(self, q: FloatArray) -> FloatArray:
+        """Return the Jacobian (2 V, K) of the vertices by the parameters; by shares it is a difference."""
+        shares = _shares(q[self.rigid :])
+        unit, size, turn = self.unit(shares), np.array([q[POSE], q[self.rigid - 1]]), _turned(float(q[2]))
+        slopes = np.zeros((len(unit), 2, len(q)))
+        slopes[:, 0, 0] = slopes[:, 1, 1] = 1.0
+        along = (unit * size) @ turn
+        slopes[:, 0, 2], slopes[:, 1, 2] = -along[:, 1], along[:, 0]
+        slopes[:, :, POSE] = unit[:, :1] * turn[0]
+        slopes[:, :, self.rigid - 1] += unit[:, 1:] * turn[1]
+        for n, share in enumerate(shares.tolist()):
+            there = shares.copy()
+            there[n] += DIFFERENCE * (1 - share)
+            change = (self.unit(there) - unit) * (share / DIFFERENCE)
+            slopes[:, :, self.rigid + n] = (change * size) @ turn
+        return slopes.reshape(-1, len(q))
+
+
+def _turned(theta: float) -> FloatArray:
+    """Return the matrix (2, 2) that turns rows of points."""
+    cos, sin = math.cos(theta), math.sin(theta)
+    return np.array([[cos, sin], [-sin, cos]])
+
+
+def _shares(odds: FloatArray) -> FloatArray:
+    """Return shares from the logarithms of their odds."""
+    return np.asarray(1 / (1 + np.exp(-odds)))
+
+
+BOX, TRIANGLE, ROUND = 4, 3, 0
+"""Corners of the kinds in whose frames fits begin."""
+
+ONCE, HALF, QUARTERS, EIGHTHS = _turns(1), _turns(2, math.pi), _turns(4), _turns(8)
+
+
+def _polygon(corners: int) -> Template:
+    period = 2 * math.pi / corners
+    starts = Start(BOX, (), _turns(4, period)), Start(ROUND, (), _turns(3, period))
+    return Template(f"a regular polygon of {corners} sides", _regular(corners), starts, corners, tied=True)
+
+
+def _star_of(points: int) -> Template:
+    period = 2 * math.pi / points
+    starts = Start(BOX, (0.65,), _turns(4, period)), Start(ROUND, (0.65,), _turns(3, period))
+    starts += (Start(TRIANGLE, (0.5,), _turns(4, period)),) if points == 5 else ()
+    return Template(f"a star of {points} points", _star(points), starts, points, tied=True)
+
+
+TEMPLATES = (
+    Template("an L", _ell, (Start(BOX, (0.5, 0.5), QUARTERS, True), Start(TRIANGLE, (0.5, 0.5), EIGHTHS))),
+    Template("a U", _u, (Start(BOX, (0.4, 0.4), QUARTERS, True),)),
+    Template("a notched box", _notched, (Start(BOX, (0.4, 0.4, 0.5), QUARTERS, True),)),
+    Template("a T", _tee, (Start(BOX, (0.5, 0.5), QUARTERS, True),)),
+    Template("a cross", _cross, (Start(BOX, (0.5, 0.5), ONCE, True),), names=4),
+    Template("an even cross", _even_cross, (Start(BOX, (0.5,), ONCE),), names=4, tied=True),
+    Template("a half disc", _half_disc, (Start(BOX, (), QUARTERS), Start(ROUND, (), EIGHTHS)), tied=True),
+    Template("a half ellipse", _half_ellipse, tuple(Start(k, (), QUARTERS) for k in (BOX, ROUND, TRIANGLE))),
+    Template("a stadium", _stadium, (Start(BOX, (0.4,), HALF, True), Start(ROUND, (0.6,), HALF)), names=2),
+    Template("a trapezoid", _trapezoid, (Start(BOX, (0.75,), QUARTERS), Start(TRIANGLE, (0.25,), ONCE))),
+    Template("a parallelogram", _parallelogram, (Start(BOX, (0.5,), HALF, True),), names=4),
+    Template("a kite", _kite, (Start(TRIANGLE, (0.25,), ONCE), Start(ROUND, (0.45,), QUARTERS)), names=2),
+    Template("an arrow", _arrow, (Start(TRIANGLE, (0.3,), ONCE, True),)),
+    Template("a scalene triangle", _scalene, (Start(TRIANGLE, (0.5,), ONCE, True),)),
+    Template("a ring segment", _ring, (Start(ROUND, (0.4, 0.6), EIGHTHS), Start(TRIANGLE, (0.5, 0.5), ONCE))),
+    *(_polygon(corners) for corners in (5, 6, 8)),
+    *(_star_of(points) for points in (4, 5, 6, 7)),
+)
+"""The families."""
+
+
+@dataclass(frozen=True)
+class TemplateFit:
+    """A template fitted to rays.
+
+    Attributes:
+        name: The template's.
+        vertices: (V, 2) in m, map frame, counter-clockwise.
+        log_evidence: Nats, comparable with that of kinds; the prior among templates is in it.
+        std: Standard deviation (m) of the outline across it; the median over its vertices.
+    """
+
+    name: str
+    vertices: FloatArray
+    log_evidence: float
+    std: float
+
+
+@dataclass(frozen=True)
+class _Point:
+    """Parameters (K,) of a template, their cost (nats) with the shares' prior, its gradient and curvature."""
+
+    template: Template
+    q: FloatArray
+    cost: float
+    gradient: FloatArray
+    curvature: FloatArray
+
+
+@dataclass(frozen=True)
+class _Cost:
+    """The negative log-likelihood of outlines, over the dispersion, scaled from some of the rays to all."""
+
+    data: RayData
+    scale: float
+    max_extent: float
+    options: TemplateOptions
+
+    def of(self, vertices: FloatArray, blur: float) -> float:
+        """Compute it for an outline (V, 2) in m at a blur (m)."""
+        return float(self.scale * outline_likelihood(vertices, self.data, blur, NO_GRADIENT, NO_INFORMATION))
+
+    def expand(self, template: Template, q: FloatArray, blur: float) -> _Point:
+        """Compute it for a template, with its derivatives; shares are uniform a priori: their log odds are not."""
+        vertices, jacobian = template.vertices(q), template.jacobian(q)
+        gradient, information = np.zeros(vertices.size), np.zeros((vertices.size, vertices.size))
+        cost = self.scale * outline_likelihood(vertices, self.data, blur, gradient, information)
+        slope = self.scale * (gradient @ jacobian)
+        curvature = self.scale * (jacobian.T @ information @ jacobian)
+        rigid, shares = template.rigid, _shares(q[template.rigid :])
+        density = shares * (1 - shares)
+        slope[rigid:] += 2 * shares - 1
+        diagonal = np.concatenate((np.ones(rigid), 2 * density))  # 1 m and 1 rad, as for kinds
+        return _Point(template, q, cost - float(np.log(density).sum()), slope, curvature + np.diag(diagonal))
+
+    def log_evidence(self, there: _Point, cost: float) -> float:
+        """Approximate the log evidence (nats) by Laplace's method, given the cost and the curvature at the mode."""
+        logarithm = linear_algebra.log_determinant(there.curvature)
+        if logarithm is None:
+            return -math.inf
+        volume = 0.5 * (len(there.q) * math.log(2 * math.pi) - logarithm)
+        return -cost + volume + there.template.log_prior(self.max_extent) - math.log(len(TEMPLATES))
+
+    def descend(self, template: Template, q: FloatArray, descent: Descent, least: float) -> _Point:
+        """Minimise it from parameters (K,) by Levenberg and Marquardt's method at each blur, none below ``least``."""
+        for blur in dict.fromkeys(max(blur, least) for blur in descent.blurs):
+            here = self._descend_at(self.expand(template, q, blur), descent, blur)
+            q = here.q
+        return here
+
+    def _descend_at(self, start: _Point, descent: Descent, blur: float) -> _Point:
+        options, here, damping = self.options, start, self.options.first_damping
+        for _ in range(descent.steps):
+            damped = here.curvature + damping * np.diag(np.diag(here.curvature))
+            step = linear_algebra.solve(damped, here.gradient)
+            if step is None:
+                break
+            there = self.expand(here.template, self._bounded(here.template, here.q - step), blur)
+            if there.cost < here.cost:
+                gain, here = here.cost - there.cost, there
+                damping = max(damping * options.damping_after_success, options.min_damping)
+                if gain < descent.tolerance:
+                    break
+            else:
+                damping *= options.damping_after_failure
+                if damping > options.max_damping:
+                    break
+        return here
+
+    def _bounded(self, template: Template, q: FloatArray) -> FloatArray:
+        """Return parameters with sizes and log odds within their bounds."""
+        rigid, odds = template.rigid, self.options.max_log_odds
+        sizes = np.clip(q[POSE:rigid], self.options.min_size, self.max_extent)
+        return np.concatenate((q[:POSE], sizes, np.clip(q[rigid:], -odds, odds)))
+
+
+def fit_templates(
+    primitives: Sequence[Primitive],
+    log_evidence: float,
+    bundle: RayBundle,
+    sensor: BeamModel,
+    max_extent: float = DEFAULTS.evidence.max_extent,
+    options: TemplateOptions = DEFAULTS.templates,
+) -> list[TemplateFit]:
+    """Fit templates to rays, as far as starts in the frames of the fitted kinds promise something.
+
+    Args:
+        primitives: The fitted kinds, likeliest first.
+        log_evidence: That of the likeliest kind (nats).
+        bundle: The rays.
+        sensor: The sensor.
+        max_extent: Upper bound (m) of sizes under the prior.
+        options: Numeric parameters.
+
+    Returns:
+        One fit for each template that is not out of the question.
+    """
+    stride = max(1, len(bundle) // options.search_rays)
+    some = sensor.data(bundle.select(slice(None, None, stride)))
+    least = max(sensor.footprint, options.least_blur)
+    search = _Cost(some, stride / sensor.dispersion, max_extent, options)
+    every = _Cost(sensor.data(bundle), 1 / sensor.dispersion, max_extent, options)
+    outline = primitives[0].outline()
+    promising = _promising(primitives, outline, every.of(outline, least), search, least)
+    limit = log_evidence - options.margin
+    chosen: dict[str, _Point] = {}
+    for predicted, point in sorted(promising, key=lambda item: -item[0]):
+        if predicted > limit and len(chosen) < options.fitted:
+            chosen.setdefault(point.template.name, point)
+    return [_evaluated(every.descend(point.template, point.q, options.fine, least), every, least) for point in chosen.values()]
+
+
+def _promising(
+    primitives: Sequence[Primitive], outline: FloatArray, cost: float, search: _Cost, least: float
+) -> list[tuple[float, _Point]]:
+    """Descend coarsely from the starts that are not much worse than the kind; with their predicted log evidence."""
+    options = search.options
+    blur = max(options.coarse.blurs[-1], least)
+    base = search.of(outline, blur)
+    promising = []
+    for template, q in starts_of(primitives):
+        if search.of(template.vertices(q), blur) < base + options.screen:
+            point = search.descend(template, q, options.coarse, least)
+            sharp = search.expand(template, point.q, max(least, options.information_blur))
+            promising.append((search.log_evidence(sharp, cost + point.cost - base), point))
+    return promising
+
+
+def _evaluated(point: _Point, cost: _Cost, least: float) -> TemplateFit:
+    """Return a fit with its evidence and uncertainty."""
+    template, q = point.template, point.q
+    there = cost.expand(template, q, max(least, cost.options.information_blur))
+    covariance = linear_algebra.inverse(there.curvature)
+    vertices, jacobian = template.vertices(q), template.jacobian(q)
+    std = math.inf if covariance is None else std_across(vertices, jacobian @ covariance @ jacobian.T)
+    return TemplateFit(template.name, vertices, cost.log_evidence(there, point.cost), std)
+
+
+def starts_of(primitives: Sequence[Primitive]) -> list[tuple[Template, FloatArray]]:
+    """Return templates with the parameters (K,) that fits begin with.
+
+    Args:
+        primitives: The fitted kinds, likeliest first; of those with equally many corners the first is used.
+
+    Returns:
+        The starts.
+    """
+    frames: dict[int, Primitive] = {}
+    for primitive in primitives:
+        frames.setdefault(primitive.kind.corners, primitive)
+    return [
+        (template, _start(template, frames[start.corners], start, turn))
+        for template in TEMPLATES
+        for start in template.starts
+        if start.corners in frames
+        for turn in start.turns
+    ]
+
+
+def _start(template: Template, primitive: Primitive, start: Start, turn: float) -> FloatArray:
+    """Return the parameters (K,) of a start in a primitive's frame, turned from it."""
+    middle, spread = _form(tuple(map(tuple, primitive.kind.vertices.tolist())), start.boxed)
+    own_middle, own_spread = _form(tuple(template.outline(*start.shares)), start.boxed)
+    size, turned = np.array(primitive.width_height), _turned(turn)
+    along = np.diag(turned @ (spread * size * size[:, None]) @ turned.T)
+    sizes = np.sqrt(along / np.diag(own_spread))
+    if template.tied:
+        sizes = np.full(2, math.sqrt(sizes[0] * sizes[1]))
+    offset = middle * size - (own_middle * sizes) @ turned
+    theta = primitive.theta or 0.0
+    place = offset @ _turned(theta) + [primitive.x, primitive.y]
+    shares = np.array(start.shares)
+    return np.array([*place, theta + turn, *sizes[: template.rigid - POSE], *np.log(shares / (1 - shares))])
+
+
+@lru_cache(maxsize=256)
+def _form(outline: tuple[tuple[float, float], ...], boxed: bool) -> tuple[FloatArray, FloatArray]:
+    """Return the middle (2,) and the spread (2, 2) of a closed outline: those of its area, or of its bounding box."""
+    vertices = np.array(outline)
+    if boxed:
+        return np.ptp(vertices, axis=0) / 2 + vertices.min(axis=0), np.diag(np.ptp(vertices, axis=0) ** 2)
+    after = np.roll(vertices, -1, axis=0)
+    twice = vertices[:, 0] * after[:, 1] - after[:, 0] * vertices[:, 1]
+    both = vertices + after
+    middle = (twice @ both) / (3 * twice.sum())
+    second = np.einsum("v,vi,vj->ij", twice, both, both) + np.einsum("v,vi,vj->ij", twice, vertices, vertices)
+    second += np.einsum("v,vi,vj->ij", twice, after, after)
+    return middle, second / (12 * twice.sum()) - np.outer(middle, middle)
