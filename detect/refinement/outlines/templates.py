@@ -11,7 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import lru_cache, partial
 
 import numpy as np
 
@@ -23,7 +23,7 @@ from detect.refinement.outlines.kernels import outline_likelihood
 from detect.refinement.outlines.polygons import std_across
 from prim import linear_algebra
 from prim.arrays import FloatArray
-from prim.shapes import Primitive
+from prim.shapes import Kind, Primitive
 
 NO_GRADIENT = np.zeros(0)
 NO_INFORMATION = np.zeros((0, 0))
@@ -34,97 +34,102 @@ POSE = 3
 DIFFERENCE = 1e-4
 """The step of a share, as a part of what is left to 1, that its derivative is taken over."""
 
-Shaped = Callable[..., Sequence[tuple[float, float]]]
-"""From shares to the vertices of a unit outline, counter-clockwise."""
+Shaped = Callable[..., FloatArray]
+"""From shares to the vertices (V, 2) of a unit outline in a box from -1/2 to 1/2, counter-clockwise."""
 
 
-def _ell(width: float, height: float) -> list[tuple[float, float]]:
+def _ell(width: float, height: float) -> FloatArray:
     x, y = 0.5 - width, 0.5 - height
-    return [(-0.5, -0.5), (0.5, -0.5), (0.5, y), (x, y), (x, 0.5), (-0.5, 0.5)]
+    return np.array([(-0.5, -0.5), (0.5, -0.5), (0.5, y), (x, y), (x, 0.5), (-0.5, 0.5)])
 
 
-def _notched(width: float, depth: float, place: float) -> list[tuple[float, float]]:
+def _notched(width: float, depth: float, place: float) -> FloatArray:
     left, y = (1 - width) * place - 0.5, 0.5 - depth
-    right = left + width
-    return [(-0.5, -0.5), (0.5, -0.5), (0.5, 0.5), (right, 0.5), (right, y), (left, y), (left, 0.5), (-0.5, 0.5)]
+    gap = [(left + width, 0.5), (left + width, y), (left, y), (left, 0.5)]
+    return np.array([(-0.5, -0.5), (0.5, -0.5), (0.5, 0.5), *gap, (-0.5, 0.5)])
 
 
-def _u(width: float, depth: float) -> list[tuple[float, float]]:
+def _u(width: float, depth: float) -> FloatArray:
     return _notched(width, depth, 0.5)
 
 
-def _tee(stem: float, bar: float) -> list[tuple[float, float]]:
+def _tee(stem: float, bar: float) -> FloatArray:
     x, y = stem / 2, 0.5 - bar
-    return [(-x, -0.5), (x, -0.5), (x, y), (0.5, y), (0.5, 0.5), (-0.5, 0.5), (-0.5, y), (-x, y)]
+    return np.array([(-x, -0.5), (x, -0.5), (x, y), (0.5, y), (0.5, 0.5), (-0.5, 0.5), (-0.5, y), (-x, y)])
 
 
-def _cross(width: float, height: float) -> list[tuple[float, float]]:
+def _cross(width: float, height: float) -> FloatArray:
     x, y = width / 2, height / 2
     right = [(x, -0.5), (x, -y), (0.5, -y), (0.5, y), (x, y), (x, 0.5)]
-    return right + [(-a, -b) for a, b in right]
+    return np.array(right + [(-a, -b) for a, b in right])
 
 
-def _even_cross(arm: float) -> list[tuple[float, float]]:
+def _even_cross(arm: float) -> FloatArray:
     return _cross(arm, arm)
 
 
-def _arc(first: float, last: float, points: int, radius: float = 0.5) -> list[tuple[float, float]]:
-    return [(radius * math.cos(t), radius * math.sin(t)) for t in np.linspace(first, last, points).tolist()]
+@lru_cache(maxsize=64)
+def _steps(points: int) -> FloatArray:
+    """Return evenly spaced numbers from -1 to 1."""
+    return np.linspace(-1, 1, points)
 
 
-def _half_disc() -> list[tuple[float, float]]:
-    return [(x, y - 0.25) for x, y in _arc(0, math.pi, 24)]
+def _arc(half: float, points: int, radius: float = 0.5) -> FloatArray:
+    """Return points (N, 2) of a circle, ``half`` (rad) to both sides of the x axis."""
+    angles = half * _steps(points)
+    return np.column_stack((radius * np.cos(angles), radius * np.sin(angles)))
 
 
-def _half_ellipse() -> list[tuple[float, float]]:
-    return [(x, 2 * y - 0.5) for x, y in _arc(0, math.pi, 24)]
+@lru_cache(maxsize=64)
+def _regular(corners: int) -> FloatArray:
+    return _arc(math.pi * (1 - 1 / corners), corners)
 
 
-def _stadium(end: float) -> list[tuple[float, float]]:
-    right = [(0.5 - end / 2 + end * x, y) for x, y in _arc(-math.pi / 2, math.pi / 2, 12)]
-    return right + [(-x, -y) for x, y in right]
+@lru_cache(maxsize=1)
+def _half_disc() -> FloatArray:
+    return _arc(math.pi / 2, 24) - [0.25, 0.0]
 
 
-def _trapezoid(top: float) -> list[tuple[float, float]]:
-    return [(-0.5, -0.5), (0.5, -0.5), (top / 2, 0.5), (-top / 2, 0.5)]
+@lru_cache(maxsize=1)
+def _half_ellipse() -> FloatArray:
+    return np.asarray(_arc(math.pi / 2, 24) * [2.0, 1.0] - [0.5, 0.0])
 
 
-def _parallelogram(shear: float) -> list[tuple[float, float]]:
-    offset = 2 * shear - 1
-    x = (1 - abs(offset)) / 2
-    return [(-x - offset / 2, -0.5), (x - offset / 2, -0.5), (x + offset / 2, 0.5), (-x + offset / 2, 0.5)]
+def _stadium(end: float) -> FloatArray:
+    right = _arc(math.pi / 2, 12) * [end, 1.0] + [0.5 - end / 2, 0.0]
+    return np.concatenate((right, -right))
 
 
-def _kite(waist: float) -> list[tuple[float, float]]:
-    return [(0.0, -0.5), (0.5, waist - 0.5), (0.0, 0.5), (-0.5, waist - 0.5)]
+def _trapezoid(top: float) -> FloatArray:
+    return np.array([(-0.5, -0.5), (0.5, -0.5), (top / 2, 0.5), (-top / 2, 0.5)])
 
 
-def _arrow(depth: float) -> list[tuple[float, float]]:
-    return [(-0.5, -0.5), (0.0, depth - 0.5), (0.5, -0.5), (0.0, 0.5)]
+def _parallelogram(shear: float) -> FloatArray:
+    offset = shear - 0.5
+    x = 0.5 - abs(offset)
+    return np.array([(-x - offset, -0.5), (x - offset, -0.5), (x + offset, 0.5), (-x + offset, 0.5)])
 
 
-def _scalene(apex: float) -> list[tuple[float, float]]:
-    return [(-0.5, -0.5), (0.5, -0.5), (apex - 0.5, 0.5)]
+def _kite(waist: float) -> FloatArray:
+    return np.array([(0.0, -0.5), (0.5, waist - 0.5), (0.0, 0.5), (-0.5, waist - 0.5)])
 
 
-def _ring(thickness: float, opening: float) -> list[tuple[float, float]]:
-    half, inner = math.pi * opening, 0.5 * (1 - thickness)
-    return _arc(-half, half, 20) + _arc(half, -half, 16, inner)
+def _arrow(depth: float) -> FloatArray:
+    return np.array([(-0.5, -0.5), (0.0, depth - 0.5), (0.5, -0.5), (0.0, 0.5)])
 
 
-def _regular(corners: int) -> Shaped:
-    return lambda: _arc(0, 2 * math.pi * (1 - 1 / corners), corners)
+def _scalene(apex: float) -> FloatArray:
+    return np.array([(-0.5, -0.5), (0.5, -0.5), (apex - 0.5, 0.5)])
 
 
-def _star(points: int) -> Shaped:
-    def outline(inner: float) -> list[tuple[float, float]]:
-        turn = math.pi / points
-        return [
-            (0.5 * r * math.cos(n * turn), 0.5 * r * math.sin(n * turn))
-            for n in range(2 * points)
-            for r in [inner if n % 2 else 1.0]
-        ]
+def _ring(thickness: float, opening: float) -> FloatArray:
+    half = math.pi * opening
+    return np.concatenate((_arc(half, 20), _arc(-half, 16, 0.5 * (1 - thickness))))
 
+
+def _star(points: int, inner: float) -> FloatArray:
+    outline = _regular(2 * points).copy()
+    outline[::2] *= inner
     return outline
 
 
@@ -184,7 +189,7 @@ class Template:
 
     def unit(self, shares: FloatArray) -> FloatArray:
         """Return the unit outline (V, 2) of some shares."""
-        return np.array(self.outline(*shares.tolist()))
+        return self.outline(*shares.tolist())
 
     def log_prior(self, max_extent: float) -> float:
         """Return the log prior density (nats; rad, m, shares) without that of the position."""
@@ -228,26 +233,27 @@ BOX, TRIANGLE, ROUND = 4, 3, 0
 """Corners of the kinds in whose frames fits begin."""
 
 ONCE, HALF, QUARTERS, EIGHTHS = _turns(1), _turns(2, math.pi), _turns(4), _turns(8)
+LEANING, BACK = (0.0, math.pi / 2, 5 * math.pi / 4), (math.pi,)
 
 
 def _polygon(corners: int) -> Template:
     period = 2 * math.pi / corners
     starts = Start(BOX, (), _turns(4, period)), Start(ROUND, (), _turns(3, period))
-    return Template(f"a regular polygon of {corners} sides", _regular(corners), starts, corners, tied=True)
+    return Template(f"a regular polygon of {corners} sides", partial(_regular, corners), starts, corners, tied=True)
 
 
 def _star_of(points: int) -> Template:
     period = 2 * math.pi / points
     starts = Start(BOX, (0.65,), _turns(4, period)), Start(ROUND, (0.65,), _turns(3, period))
     starts += (Start(TRIANGLE, (0.5,), _turns(4, period)),) if points == 5 else ()
-    return Template(f"a star of {points} points", _star(points), starts, points, tied=True)
+    return Template(f"a star of {points} points", partial(_star, points), starts, points, tied=True)
 
 
 TEMPLATES = (
-    Template("an L", _ell, (Start(BOX, (0.5, 0.5), QUARTERS, True), Start(TRIANGLE, (0.5, 0.5), EIGHTHS))),
+    Template("an L", _ell, (Start(BOX, (0.5, 0.5), QUARTERS, True), Start(TRIANGLE, (0.5, 0.5), LEANING))),
     Template("a U", _u, (Start(BOX, (0.4, 0.4), QUARTERS, True),)),
     Template("a notched box", _notched, (Start(BOX, (0.4, 0.4, 0.5), QUARTERS, True),)),
-    Template("a T", _tee, (Start(BOX, (0.5, 0.5), QUARTERS, True),)),
+    Template("a T", _tee, (Start(BOX, (0.5, 0.5), QUARTERS, True), Start(TRIANGLE, (0.4, 0.4), BACK))),
     Template("a cross", _cross, (Start(BOX, (0.5, 0.5), ONCE, True),), names=4),
     Template("an even cross", _even_cross, (Start(BOX, (0.5,), ONCE),), names=4, tied=True),
     Template("a half disc", _half_disc, (Start(BOX, (), QUARTERS), Start(ROUND, (), EIGHTHS)), tied=True),
@@ -255,7 +261,7 @@ TEMPLATES = (
     Template("a stadium", _stadium, (Start(BOX, (0.4,), HALF, True), Start(ROUND, (0.6,), HALF)), names=2),
     Template("a trapezoid", _trapezoid, (Start(BOX, (0.75,), QUARTERS), Start(TRIANGLE, (0.25,), ONCE))),
     Template("a parallelogram", _parallelogram, (Start(BOX, (0.5,), HALF, True),), names=4),
-    Template("a kite", _kite, (Start(TRIANGLE, (0.25,), ONCE), Start(ROUND, (0.45,), QUARTERS)), names=2),
+    Template("a kite", _kite, (*(Start(TRIANGLE, (k,), ONCE) for k in (0.1, 0.3)), Start(ROUND, (0.45,), QUARTERS)), names=2),
     Template("an arrow", _arrow, (Start(TRIANGLE, (0.3,), ONCE, True),)),
     Template("a scalene triangle", _scalene, (Start(TRIANGLE, (0.5,), ONCE, True),)),
     Template("a ring segment", _ring, (Start(ROUND, (0.4, 0.6), EIGHTHS), Start(TRIANGLE, (0.5, 0.5), ONCE))),
@@ -445,8 +451,8 @@ def starts_of(primitives: Sequence[Primitive]) -> list[tuple[Template, FloatArra
 
 def _start(template: Template, primitive: Primitive, start: Start, turn: float) -> FloatArray:
     """Return the parameters (K,) of a start in a primitive's frame, turned from it."""
-    middle, spread = _form(tuple(map(tuple, primitive.kind.vertices.tolist())), start.boxed)
-    own_middle, own_spread = _form(tuple(template.outline(*start.shares)), start.boxed)
+    middle, spread = _form_of_kind(primitive.kind, start.boxed)
+    own_middle, own_spread = _form_of_start(template, start)
     size, turned = np.array(primitive.width_height), _turned(turn)
     along = np.diag(turned @ (spread * size * size[:, None]) @ turned.T)
     sizes = np.sqrt(along / np.diag(own_spread))
@@ -459,10 +465,18 @@ def _start(template: Template, primitive: Primitive, start: Start, turn: float) 
     return np.array([*place, theta + turn, *sizes[: template.rigid - POSE], *np.log(shares / (1 - shares))])
 
 
+@lru_cache(maxsize=16)
+def _form_of_kind(kind: Kind, boxed: bool) -> tuple[FloatArray, FloatArray]:
+    return _form(kind.vertices, boxed)
+
+
 @lru_cache(maxsize=256)
-def _form(outline: tuple[tuple[float, float], ...], boxed: bool) -> tuple[FloatArray, FloatArray]:
+def _form_of_start(template: Template, start: Start) -> tuple[FloatArray, FloatArray]:
+    return _form(template.outline(*start.shares), start.boxed)
+
+
+def _form(vertices: FloatArray, boxed: bool) -> tuple[FloatArray, FloatArray]:
     """Return the middle (2,) and the spread (2, 2) of a closed outline: those of its area, or of its bounding box."""
-    vertices = np.array(outline)
     if boxed:
         return np.ptp(vertices, axis=0) / 2 + vertices.min(axis=0), np.diag(np.ptp(vertices, axis=0) ** 2)
     after = np.roll(vertices, -1, axis=0)
