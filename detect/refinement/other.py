@@ -1,13 +1,14 @@
 """None of the kinds: what else may explain a candidate's rays, and how likely that is.
 
-Three hypotheses compete with the kinds for the same rays: a deformed primitive and a free polygon
-(detect.refinement.outlines), which are shapes of their own, and a part of something larger, which goes on in the map.
+Four hypotheses compete with the kinds for the same rays: a deformed primitive, a free polygon and templates of few
+parameters (detect.refinement.outlines), which are shapes of their own, and a part of something larger, which goes on
+in the map.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -23,6 +24,7 @@ from detect.refinement.options import DEFAULTS, OtherOptions
 from detect.refinement.outlines.contact import contact_of, is_flush
 from detect.refinement.outlines.free_outline import OutlineCost, StarOutline, fit_free_outline, score_test
 from detect.refinement.outlines.polygons import contour_of, fit_polygons, polygon_starts
+from detect.refinement.outlines.templates import fit_templates
 from prim.arrays import FloatArray
 from prim.metrics import outline_iou
 from prim.shapes import Kind, Primitive
@@ -63,13 +65,18 @@ def free_alternatives(
         fit.kind: laplace_evidence(fit, sensor.dispersion, candidate.options.evidence) for fit in candidate.fits
     }
     best = max(candidate.fits, key=lambda fit: evidence[fit.kind])
-    found = [
-        _deformed(candidate, best, bundle, sensor),
-        _polygon(candidate, evidence[best.kind], bundle, candidates, sensor),
-    ]
-    kind = primitive_of(best.kind, best.p)
-    limit = 1 - candidate.options.other.min_difference
-    return [one for one in found if one is not None and outline_iou(one.vertices, kind.outline()) < limit]
+    deformed = _deformed(candidate, best, bundle, sensor)
+    polygon = _polygon(candidate, evidence[best.kind], bundle, candidates, sensor)
+    outline, other = primitive_of(best.kind, best.p).outline(), candidate.options.other
+    found = _different([one for one in (deformed, polygon) if one is not None], outline, other)
+    if any(one.log_odds > other.overwhelming for one in found):
+        return found
+    return found + _different(_templates(candidate, evidence, bundle, sensor), outline, other)
+
+
+def _different(found: Sequence[Alternative], outline: FloatArray, options: OtherOptions) -> list[Alternative]:
+    """Return the alternatives that differ from the likeliest kind's outline (V, 2)."""
+    return [one for one in found if outline_iou(one.vertices, outline) < 1 - options.min_difference]
 
 
 def _deformed(candidate: Candidate, best: KindFit, bundle: RayBundle, sensor: BeamModel) -> Alternative | None:
@@ -101,6 +108,22 @@ def _polygon(
     log_odds = fit.log_evidence - evidence - candidate.options.other.polygon_handicap
     reason = f"a polygon of {len(fit.vertices)} vertices explains its rays better by {log_odds:.0f} nats"
     return Alternative(fit.vertices, log_odds, fit.std, reason)
+
+
+def _templates(
+    candidate: Candidate, evidence: Mapping[Kind, float], bundle: RayBundle, sensor: BeamModel
+) -> list[Alternative]:
+    """Fit templates in the frames of the fitted kinds."""
+    options = candidate.options
+    ranked = sorted(candidate.fits, key=lambda fit: -evidence[fit.kind])
+    primitives, likeliest = [primitive_of(fit.kind, fit.p) for fit in ranked], evidence[ranked[0].kind]
+    fits = fit_templates(primitives, likeliest, bundle, sensor, options.evidence.max_extent, options.templates)
+    found = []
+    for fit in fits:
+        log_odds = fit.log_evidence - likeliest - options.other.template_handicap
+        reason = f"{fit.name} explains its rays better by {log_odds:.0f} nats"
+        found.append(Alternative(fit.vertices, log_odds, fit.std, reason))
+    return found
 
 
 def larger_alternatives(

@@ -34,6 +34,9 @@ POSE = 3
 DIFFERENCE = 1e-4
 """The step of a share, as a part of what is left to 1, that its derivative is taken over."""
 
+BLUNTEST = 0.85
+"""The largest inner radius of a star, as a share of that of the regular polygon around it: beyond, it is that."""
+
 Shaped = Callable[..., FloatArray]
 """From shares to the vertices (V, 2) of a unit outline in a box from -1/2 to 1/2, counter-clockwise."""
 
@@ -128,8 +131,9 @@ def _ring(thickness: float, opening: float) -> FloatArray:
 
 
 def _star(points: int, inner: float) -> FloatArray:
+    """Return a star; its inner radius is a share of that of the regular polygon around it, up to BLUNTEST."""
     outline = _regular(2 * points).copy()
-    outline[::2] *= inner
+    outline[::2] *= inner * BLUNTEST * math.cos(math.pi / points)
     return outline
 
 
@@ -238,16 +242,17 @@ LEANING, BACK = (0.0, math.pi / 2, 5 * math.pi / 4), (math.pi,)
 
 def _polygon(corners: int) -> Template:
     period = 2 * math.pi / corners
-    starts = Start(BOX, (), _turns(4, period)), Start(ROUND, (), _turns(3, period))
+    starts = (Start(BOX, (), _turns(4, period)), Start(ROUND, (), _turns(3, period)))
     return Template(f"a regular polygon of {corners} sides", partial(_regular, corners), starts, corners, tied=True)
 
 
 def _star_of(points: int) -> Template:
     period = 2 * math.pi / points
-    starts = Start(BOX, (0.65,), _turns(4, period)), Start(ROUND, (0.65,), _turns(3, period))
-    starts += (Start(TRIANGLE, (0.5,), _turns(4, period)),) if points == 5 else ()
+    starts = Start(BOX, (0.85,), _turns(4, period)), Start(ROUND, (0.85,), _turns(3, period))
     return Template(f"a star of {points} points", partial(_star, points), starts, points, tied=True)
 
+
+_KITES = (Start(TRIANGLE, (0.1,), ONCE), Start(TRIANGLE, (0.3,), ONCE), Start(ROUND, (0.45,), QUARTERS))
 
 TEMPLATES = (
     Template("an L", _ell, (Start(BOX, (0.5, 0.5), QUARTERS, True), Start(TRIANGLE, (0.5, 0.5), LEANING))),
@@ -261,7 +266,12 @@ TEMPLATES = (
     Template("a stadium", _stadium, (Start(BOX, (0.4,), HALF, True), Start(ROUND, (0.6,), HALF)), names=2),
     Template("a trapezoid", _trapezoid, (Start(BOX, (0.75,), QUARTERS), Start(TRIANGLE, (0.25,), ONCE))),
     Template("a parallelogram", _parallelogram, (Start(BOX, (0.5,), HALF, True),), names=4),
-    Template("a kite", _kite, (*(Start(TRIANGLE, (k,), ONCE) for k in (0.1, 0.3)), Start(ROUND, (0.45,), QUARTERS)), names=2),
+    Template(
+        "a kite",
+        _kite,
+        (*(Start(TRIANGLE, (k,), ONCE) for k in (0.1, 0.3)), Start(ROUND, (0.45,), QUARTERS)),
+        names=2,
+    ),
     Template("an arrow", _arrow, (Start(TRIANGLE, (0.3,), ONCE, True),)),
     Template("a scalene triangle", _scalene, (Start(TRIANGLE, (0.5,), ONCE, True),)),
     Template("a ring segment", _ring, (Start(ROUND, (0.4, 0.6), EIGHTHS), Start(TRIANGLE, (0.5, 0.5), ONCE))),
@@ -307,6 +317,15 @@ class _Cost:
     scale: float
     max_extent: float
     options: TemplateOptions
+
+    @classmethod
+    def of_rays(
+        cls, bundle: RayBundle, about: int, sensor: BeamModel, max_extent: float, options: TemplateOptions
+    ) -> _Cost:
+        """Make the cost of about so many of a bundle's rays."""
+        stride = max(1, len(bundle) // about)
+        data = sensor.data(bundle.select(slice(None, None, stride)))
+        return cls(data, stride / sensor.dispersion, max_extent, options)
 
     def of(self, vertices: FloatArray, blur: float) -> float:
         """Compute it for an outline (V, 2) in m at a blur (m)."""
@@ -387,35 +406,38 @@ def fit_templates(
     Returns:
         One fit for each template that is not out of the question.
     """
-    stride = max(1, len(bundle) // options.search_rays)
-    some = sensor.data(bundle.select(slice(None, None, stride)))
     least = max(sensor.footprint, options.least_blur)
-    search = _Cost(some, stride / sensor.dispersion, max_extent, options)
-    every = _Cost(sensor.data(bundle), 1 / sensor.dispersion, max_extent, options)
+    few, some, every = (_Cost.of_rays(bundle, about, sensor, max_extent, options) for about in options.rays)
     outline = primitives[0].outline()
-    promising = _promising(primitives, outline, every.of(outline, least), search, least)
-    limit = log_evidence - options.margin
+    first = _first_stage(primitives, outline, few, least)
+    cost = every.of(outline, least)
+    base = some.of(outline, max(options.coarse.blurs[-1], least))
+    promising = []
+    for point in first:
+        there = some.descend(point.template, point.q, options.coarse, least)
+        sharp = some.expand(there.template, there.q, max(least, options.information_blur))
+        promising.append((some.log_evidence(sharp, cost + there.cost - base), there))
     chosen: dict[str, _Point] = {}
     for predicted, point in sorted(promising, key=lambda item: -item[0]):
-        if predicted > limit and len(chosen) < options.fitted:
+        if predicted > log_evidence - options.margin and len(chosen) < options.fitted:
             chosen.setdefault(point.template.name, point)
-    return [_evaluated(every.descend(point.template, point.q, options.fine, least), every, least) for point in chosen.values()]
+    return [
+        _evaluated(every.descend(point.template, point.q, options.fine, least), every, least)
+        for point in chosen.values()
+    ]
 
 
-def _promising(
-    primitives: Sequence[Primitive], outline: FloatArray, cost: float, search: _Cost, least: float
-) -> list[tuple[float, _Point]]:
-    """Descend coarsely from the starts that are not much worse than the kind; with their predicted log evidence."""
-    options = search.options
-    blur = max(options.coarse.blurs[-1], least)
-    base = search.of(outline, blur)
-    promising = []
-    for template, q in starts_of(primitives):
-        if search.of(template.vertices(q), blur) < base + options.screen:
-            point = search.descend(template, q, options.coarse, least)
-            sharp = search.expand(template, point.q, max(least, options.information_blur))
-            promising.append((search.log_evidence(sharp, cost + point.cost - base), point))
-    return promising
+def _first_stage(primitives: Sequence[Primitive], outline: FloatArray, cost: _Cost, least: float) -> list[_Point]:
+    """Descend some steps from the starts that are not much worse than the kind, and return the best."""
+    options = cost.options
+    blur = max(options.first.blurs[-1], least)
+    base = cost.of(outline, blur)
+    tried = [(cost.of(template.vertices(q), blur) - base, template, q) for template, q in starts_of(primitives)]
+    points = [
+        cost.descend(template, q, options.first, least) for worse, template, q in tried if worse < options.screen
+    ]
+    points = [point for point in points if point.cost < base + options.first_screen]
+    return sorted(points, key=lambda point: point.cost)[: options.kept]
 
 
 def _evaluated(point: _Point, cost: _Cost, least: float) -> TemplateFit:
