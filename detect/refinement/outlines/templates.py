@@ -299,7 +299,7 @@ class TemplateFit:
 
 
 @dataclass(frozen=True)
-class _Point:
+class Expansion:
     """Parameters (K,) of a template, their cost (nats) with the shares' prior, its gradient and curvature."""
 
     template: Template
@@ -310,7 +310,7 @@ class _Point:
 
 
 @dataclass(frozen=True)
-class _Cost:
+class Cost:
     """The negative log-likelihood of outlines, over the dispersion, scaled from some of the rays to all."""
 
     data: RayData
@@ -321,7 +321,7 @@ class _Cost:
     @classmethod
     def of_rays(
         cls, bundle: RayBundle, about: int, sensor: BeamModel, max_extent: float, options: TemplateOptions
-    ) -> _Cost:
+    ) -> Cost:
         """Make the cost of about so many of a bundle's rays."""
         stride = max(1, len(bundle) // about)
         data = sensor.data(bundle.select(slice(None, None, stride)))
@@ -331,7 +331,7 @@ class _Cost:
         """Compute it for an outline (V, 2) in m at a blur (m)."""
         return float(self.scale * outline_likelihood(vertices, self.data, blur, NO_GRADIENT, NO_INFORMATION))
 
-    def expand(self, template: Template, q: FloatArray, blur: float) -> _Point:
+    def expand(self, template: Template, q: FloatArray, blur: float) -> Expansion:
         """Compute it for a template, with its derivatives; shares are uniform a priori: their log odds are not."""
         vertices, jacobian = template.vertices(q), template.jacobian(q)
         gradient, information = np.zeros(vertices.size), np.zeros((vertices.size, vertices.size))
@@ -342,9 +342,9 @@ class _Cost:
         density = shares * (1 - shares)
         slope[rigid:] += 2 * shares - 1
         diagonal = np.concatenate((np.ones(rigid), 2 * density))  # 1 m and 1 rad, as for kinds
-        return _Point(template, q, cost - float(np.log(density).sum()), slope, curvature + np.diag(diagonal))
+        return Expansion(template, q, cost - float(np.log(density).sum()), slope, curvature + np.diag(diagonal))
 
-    def log_evidence(self, there: _Point, cost: float) -> float:
+    def log_evidence(self, there: Expansion, cost: float) -> float:
         """Approximate the log evidence (nats) by Laplace's method, given the cost and the curvature at the mode."""
         logarithm = linear_algebra.log_determinant(there.curvature)
         if logarithm is None:
@@ -352,14 +352,14 @@ class _Cost:
         volume = 0.5 * (len(there.q) * math.log(2 * math.pi) - logarithm)
         return -cost + volume + there.template.log_prior(self.max_extent) - math.log(len(TEMPLATES))
 
-    def descend(self, template: Template, q: FloatArray, descent: Descent, least: float) -> _Point:
+    def descend(self, template: Template, q: FloatArray, descent: Descent, least: float) -> Expansion:
         """Minimise it from parameters (K,) by Levenberg and Marquardt's method at each blur, none below ``least``."""
         for blur in dict.fromkeys(max(blur, least) for blur in descent.blurs):
             here = self._descend_at(self.expand(template, q, blur), descent, blur)
             q = here.q
         return here
 
-    def _descend_at(self, start: _Point, descent: Descent, blur: float) -> _Point:
+    def _descend_at(self, start: Expansion, descent: Descent, blur: float) -> Expansion:
         options, here, damping = self.options, start, self.options.first_damping
         for _ in range(descent.steps):
             damped = here.curvature + damping * np.diag(np.diag(here.curvature))
@@ -407,7 +407,7 @@ def fit_templates(
         One fit for each template that is not out of the question.
     """
     least = max(sensor.footprint, options.least_blur)
-    few, some, every = (_Cost.of_rays(bundle, about, sensor, max_extent, options) for about in options.rays)
+    few, some, every = (Cost.of_rays(bundle, about, sensor, max_extent, options) for about in options.rays)
     outline = primitives[0].outline()
     first = _first_stage(primitives, outline, few, least)
     cost = every.of(outline, least)
@@ -417,7 +417,7 @@ def fit_templates(
         there = some.descend(point.template, point.q, options.coarse, least)
         sharp = some.expand(there.template, there.q, max(least, options.information_blur))
         promising.append((some.log_evidence(sharp, cost + there.cost - base), there))
-    chosen: dict[str, _Point] = {}
+    chosen: dict[str, Expansion] = {}
     for predicted, point in sorted(promising, key=lambda item: -item[0]):
         if predicted > log_evidence - options.margin and len(chosen) < options.fitted:
             chosen.setdefault(point.template.name, point)
@@ -427,7 +427,7 @@ def fit_templates(
     ]
 
 
-def _first_stage(primitives: Sequence[Primitive], outline: FloatArray, cost: _Cost, least: float) -> list[_Point]:
+def _first_stage(primitives: Sequence[Primitive], outline: FloatArray, cost: Cost, least: float) -> list[Expansion]:
     """Descend some steps from the starts that are not much worse than the kind, and return the best."""
     options = cost.options
     blur = max(options.first.blurs[-1], least)
@@ -440,7 +440,7 @@ def _first_stage(primitives: Sequence[Primitive], outline: FloatArray, cost: _Co
     return sorted(points, key=lambda point: point.cost)[: options.kept]
 
 
-def _evaluated(point: _Point, cost: _Cost, least: float) -> TemplateFit:
+def _evaluated(point: Expansion, cost: Cost, least: float) -> TemplateFit:
     """Return a fit with its evidence and uncertainty."""
     template, q = point.template, point.q
     there = cost.expand(template, q, max(least, cost.options.information_blur))
