@@ -7,7 +7,8 @@
 mappers, with refinement and without; driven sessions with ``--match-scans``, with ``--pose fused`` and with
 ``--detect-every``; and the logs pillars4.mcap and csail.mcap where they are available. It stores hashes of the
 recorded logs, and the reports without timings and paths. ``compare`` prints which differ, and by how much at most; it
-exits with 1 where any difference exceeds TOLERANCE.
+exits with 1 where any difference exceeds TOLERANCE. Keys that reports have only afterwards are listed, and are no
+difference: the schema lets keys be added.
 """
 
 from __future__ import annotations
@@ -157,10 +158,11 @@ def differences(before: Any, after: Any, at: str = "") -> Iterator[tuple[str, fl
 
     Yields:
         The path of each difference and its size: relative above 1, absolute below; infinite except between numbers.
+        A key that ``after`` has alone is none.
     """
     if isinstance(before, dict) and isinstance(after, dict):
-        for key in before.keys() | after.keys():
-            if key not in before or key not in after:
+        for key in before:
+            if key not in after:
                 yield f"{at}.{key}", float("inf")
             else:
                 yield from differences(before[key], after[key], f"{at}.{key}")
@@ -171,6 +173,28 @@ def differences(before: Any, after: Any, at: str = "") -> Iterator[tuple[str, fl
         numbers = all(isinstance(value, float | int) and not isinstance(value, bool) for value in (before, after))
         size = abs(before - after) / max(1.0, abs(before)) if numbers else math.inf
         yield at, math.inf if math.isnan(size) else size
+
+
+def added_keys(before: Any, after: Any, at: str = "") -> Iterator[str]:
+    """Find the keys that were added.
+
+    Args:
+        before: The first JSON value.
+        after: The second one.
+        at: Path to them.
+
+    Yields:
+        The path of each key that ``after`` has alone; those of all items of a list have one path.
+    """
+    if isinstance(before, dict) and isinstance(after, dict):
+        for key, value in after.items():
+            if key in before:
+                yield from added_keys(before[key], value, f"{at}.{key}")
+            else:
+                yield f"{at}.{key}"
+    elif isinstance(before, list) and isinstance(after, list):
+        for one, other in zip(before, after, strict=False):
+            yield from added_keys(one, other, f"{at}[]")
 
 
 def compare(before: dict[str, Any], after: dict[str, Any]) -> bool:
@@ -197,6 +221,10 @@ def compare(before: dict[str, Any], after: dict[str, Any]) -> bool:
             worst = max(worst, largest[1])
             if largest[1] > TOLERANCE:
                 print(f"  {largest[0]}: {largest[1]:g} ({len(found)} values differ)")
+    reports = before["reports"].items()
+    added = {key for name, one in reports for key in added_keys(one, after["reports"].get(name))}
+    if added:
+        print(f"keys that reports have only afterwards: {', '.join(sorted(added))}")
     print(f"largest difference: {worst:g} (the same up to {TOLERANCE:g})")
     return worst <= TOLERANCE
 

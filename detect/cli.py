@@ -327,6 +327,13 @@ def _evaluate(
         list[RecordingMode] | None,
         typer.Option(help="Of --suite shipped: a recording mode; may be repeated. [default: all]"),
     ] = None,
+    closed_world: Annotated[
+        bool,
+        typer.Option(
+            "--closed-world",
+            help="Of --suite shipped: take all to be one of the kinds, or a wall; in rows of its own.",
+        ),
+    ] = False,
     jobs: Annotated[
         int | None,
         typer.Option(metavar="N", help="Of --suite shipped: worker processes. [default: one per core]", min=1),
@@ -351,8 +358,8 @@ def _evaluate(
     Missing sets are made, and an interrupted run is continued. paper: reproduces Tables I and II, with networks
     trained as in the paper, beside the paper's numbers; needs the extra [train], and --trust to continue a run;
     writes paper.md, paper.csv, paper.png. shipped: evaluates
-    weights, without and with refinement, on fresh sessions (selected by --sessions, --mapper and --recorded; the
-    report shows all existing results); writes shipped.md, shipped.csv.
+    weights, without and with refinement, on fresh sessions (selected by --sessions, --mapper, --recorded and
+    --closed-world; the report shows all existing results); writes shipped.md, shipped.csv.
     """
 
     def announce(text: str) -> None:
@@ -362,6 +369,7 @@ def _evaluate(
     folder = output or work / "report"
     if suite is SuiteName.PAPER:
         given = {"--weights": weights, "--mapper": mapper, "--recorded": recorded, "--jobs": jobs}
+        given["--closed-world"] = closed_world or None
         for name in (name for name, value in given.items() if value is not None):
             raise UsageError(f"{name} goes with --suite shipped")
         require_training_extra()
@@ -385,7 +393,7 @@ def _evaluate(
         mappers, modes = (
             [name.value for name in names] for names in (mapper or MapperName, recorded or RecordingMode)
         )
-        results = shipped.results() if so_far else shipped.run(sessions, mappers, modes, jobs)
+        results = shipped.results() if so_far else shipped.run(sessions, mappers, modes, jobs, closed_world)
         written = write_shipped_report(results, folder, force)
     for path in written:
         announce(f"wrote: {path}")

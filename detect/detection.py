@@ -12,6 +12,9 @@ from prim.arrays import FloatArray
 from prim.shapes import Kind, Primitive
 from prim.world import Bounds
 
+OTHER = "other"
+"""What the hypothesis «none of the kinds» is called beside the kinds' names."""
+
 
 @dataclass(frozen=True)
 class Detection:

@@ -326,6 +326,11 @@ class Tracker:
         self.tracks: list[Track] = []
         self._next_id = 1
 
+    @property
+    def last_id(self) -> int:
+        """The largest id that a track was ever given; 0 before the first."""
+        return self._next_id - 1
+
     def update(self, detections: Sequence[Detection], stamp: int) -> list[Track]:
         """Associate the detections of one map with tracks.
 

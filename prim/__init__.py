@@ -22,12 +22,14 @@ if TYPE_CHECKING:
     from prim.world import World
     from recorder.api import record
     from replay.api import LaserTrajectory, Result, make_mapper, open_log, posed_scans, refine, replay, replay_each
+    from replay.outputs.found_objects import FoundObject
     from replay.outputs.found_primitives import FoundPrimitive
     from replay.outputs.picture import Picture
 
 __version__ = "0.2.0"
 
 __all__ = [
+    "FoundObject",
     "FoundPrimitive",
     "GridFrame",
     "Kind",
@@ -56,6 +58,7 @@ __all__ = [
 _, __getattr__, __dir__ = lazy_exports(
     __name__,
     {
+        "FoundObject": "replay.outputs.found_objects",
         "FoundPrimitive": "replay.outputs.found_primitives",
         "GridFrame": "mapping.grid",
         "Kind": "prim.shapes",

@@ -93,9 +93,7 @@ def polygon_iou(a: Primitive, b: Primitive) -> float:
     Returns:
         From 0 to 1.
     """
-    first, second, shared = polygon_areas(a, b)
-    union = first + second - shared
-    return shared / union if union > 0 else 0.0
+    return outline_iou(a.outline(), b.outline())
 
 
 def outline_iou(a: FloatArray, b: FloatArray) -> float:
@@ -108,12 +106,9 @@ def outline_iou(a: FloatArray, b: FloatArray) -> float:
     Returns:
         From 0 to 1; 0 where neither has an area.
     """
-    import shapely
-
-    first, second = (shapely.make_valid(shapely.Polygon(vertices)) for vertices in (a, b))
-    shared = shapely.intersection(first, second, grid_size=OVERLAY_GRID).area
-    union = first.area + second.area - shared
-    return float(shared / union) if union > 0 else 0.0
+    first, second, shared = outline_areas(a, b)
+    union = first + second - shared
+    return shared / union if union > 0 else 0.0
 
 
 def overlap_coefficient(a: Primitive, b: Primitive) -> float:
@@ -128,24 +123,39 @@ def overlap_coefficient(a: Primitive, b: Primitive) -> float:
     """
     if math.hypot(a.x - b.x, a.y - b.y) > a.bounding_radius + b.bounding_radius:
         return 0.0
-    first, second, shared = polygon_areas(a, b)
+    return outline_overlap(a.outline(), b.outline())
+
+
+def outline_overlap(a: FloatArray, b: FloatArray) -> float:
+    """Compute the overlap coefficient of two outlines: their intersection over the smaller one's area.
+
+    Args:
+        a: Vertices (N, 2) of one in m, convex or not.
+        b: Those (M, 2) of the other.
+
+    Returns:
+        From 0 to 1.
+    """
+    first, second, shared = outline_areas(a, b)
     smaller = min(first, second)
     return shared / smaller if smaller > 0 else 0.0
 
 
-def polygon_areas(a: Primitive, b: Primitive) -> tuple[float, float, float]:
-    """Compute the areas of two outlines' polygons and of their intersection.
+def outline_areas(a: FloatArray, b: FloatArray) -> tuple[float, float, float]:
+    """Compute the areas of two outlines and of their intersection.
 
     Args:
-        a: One primitive.
-        b: The other.
+        a: Vertices (N, 2) of one in m, convex or not; one that crosses itself counts by the even-odd rule.
+        b: Those (M, 2) of the other.
 
     Returns:
         Area of ``a``, of ``b``, of the intersection (m^2).
     """
     import shapely  # here, so that a replay without detections starts faster
 
-    first, second = shapely.Polygon(a.outline()), shapely.Polygon(b.outline())
+    first, second = (
+        polygon if polygon.is_valid else shapely.make_valid(polygon) for polygon in map(shapely.Polygon, (a, b))
+    )
     shared = shapely.intersection(first, second, grid_size=OVERLAY_GRID)
     return float(first.area), float(second.area), float(shared.area)
 

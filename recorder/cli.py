@@ -16,6 +16,9 @@ from prim import __version__, console
 from prim.errors import UsageError
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from prim.world import Solid
     from recorder.session import Session, SessionOptions
 
 FOV = 6.28
@@ -30,6 +33,15 @@ class MotionName(StrEnum):
 
     WARP = "warp"
     DRIVE = "drive"
+
+
+class DropoutName(StrEnum):
+    """What is written for a beam that returned nothing; ``max`` is the longest range."""
+
+    INF = "inf"
+    NAN = "nan"
+    ZERO = "0"
+    MAX = "max"
 
 
 app = typer.Typer(add_completion=False, rich_markup_mode=None)
@@ -62,6 +74,23 @@ def record(
         str | None,
         typer.Option(metavar="N or A-B", help="How many of each kind: a number or a range. [default: 0-2]"),
     ] = None,
+    clutter: Annotated[
+        str | None,
+        typer.Option(metavar="N or A-B", help="How many things that are none of the kinds. [default: 0]"),
+    ] = None,
+    room: Annotated[
+        str | None,
+        typer.Option(
+            metavar="NAME,...",
+            help="box, round, corridor or L; doorways, pilasters, furniture; or some of them. [default: box]",
+        ),
+    ] = None,
+    at_walls: Annotated[
+        float | None, typer.Option(metavar="M", help="Every primitive stands this far from a wall; 0: it touches it.")
+    ] = None,
+    touching: Annotated[
+        bool, typer.Option("--touching", help="Primitives stand in pairs that touch each other.")
+    ] = False,
     motion: Annotated[
         MotionName, typer.Option(help="The robot is set on a grid of positions, or drives.")
     ] = MotionName.WARP,
@@ -94,6 +123,19 @@ def record(
             metavar="M", help="LiDAR noise (std), metres; excludes --noise. [default: 0.05]", show_default=False
         ),
     ] = None,
+    range_bias: Annotated[float, typer.Option(metavar="M", help="Added to each range, metres.")] = 0.0,
+    beam_width: Annotated[
+        float, typer.Option(metavar="DEG", help="Full width of a beam, degrees: mixed ranges at edges.")
+    ] = 0.0,
+    quantum: Annotated[float, typer.Option(metavar="M", help="Ranges are multiples of this, metres.")] = 0.0,
+    dropout: Annotated[float, typer.Option(metavar="SHARE", help="Share of beams that return nothing.")] = 0.0,
+    dropout_as: Annotated[
+        DropoutName | None, typer.Option(help="What is written for them. [default: inf]", show_default=False)
+    ] = None,
+    outliers: Annotated[float, typer.Option(metavar="SHARE", help="Share of beams with any range.")] = 0.0,
+    noise_growth: Annotated[
+        float, typer.Option(metavar="M/M", help="LiDAR noise (std) that grows, metres per metre of range.")
+    ] = 0.0,
     gps_noise: Annotated[float, typer.Option(metavar="M", help="GPS noise (std), metres.")] = 0.1,
     compass_noise: Annotated[float, typer.Option(metavar="DEG", help="Compass noise (std), degrees.")] = 3.0,
     force: Annotated[
@@ -115,7 +157,11 @@ def record(
         size=size,
         walls=walls,
         kinds=kinds,
-        per_kind=_parse_counts(per_kind),
+        per_kind=_parse_counts("--per-kind", per_kind),
+        clutter=_parse_counts("--clutter", clutter),
+        room=room,
+        at_walls=at_walls,
+        touching=touching,
         motion=motion.value,
         stops=stops,
         duration=duration,
@@ -129,6 +175,13 @@ def record(
         range_max=range_max,
         noise=noise,
         noise_std=noise_std,
+        range_bias=range_bias,
+        beam_width=math.radians(beam_width),
+        quantum=quantum,
+        dropout=dropout,
+        dropout_as=None if dropout_as is None else dropout_as.value,
+        outliers=outliers,
+        noise_growth=noise_growth,
         gps_noise=gps_noise,
         compass_noise=math.radians(compass_noise),
     )
@@ -147,7 +200,7 @@ def _fov_radians(degrees: float) -> float:
     return FOV if degrees == FOV_DEGREES else math.radians(degrees)
 
 
-def _parse_counts(text: str | None) -> tuple[int, int] | None:
+def _parse_counts(option: str, text: str | None) -> tuple[int, int] | None:
     """Parse a number or a range such as 0-2; None stays None. Raises UsageError."""
     if text is None:
         return None
@@ -155,17 +208,43 @@ def _parse_counts(text: str | None) -> tuple[int, int] | None:
     try:
         return int(first), int(last or first)
     except ValueError:
-        raise UsageError(f"--per-kind {text!r} is neither a number nor a range such as 0-2") from None
+        raise UsageError(f"{option} {text!r} is neither a number nor a range such as 0-2") from None
 
 
 def _summary(session: Session, options: SessionOptions) -> str:
-    counts = Counter(str(primitive.kind) for primitive in session.world.primitives)
-    what = ", ".join(f"{count} {kind}{'s' * (count > 1)}" for kind, count in counts.items()) or "no primitives"
+    world = session.world
     skipped = f" ({session.skipped} stops skipped: something stands there)" if session.skipped else ""
-    return (
-        f"{session.path}: {session.scans} scans of {options.lidar.rays} rays{skipped}, "
-        f"noise {options.lidar.noise_std * MM_PER_M:g} mm, {what}"
-    )
+    counts = Counter(str(primitive.kind) for primitive in world.primitives)
+    said = [
+        f"{session.path}: {session.scans} scans of {options.lidar.rays} rays{skipped}",
+        f"noise {options.lidar.noise_std * MM_PER_M:g} mm",
+        *_faults(options),
+        ", ".join(f"{count} {kind}{'s' * (count > 1)}" for kind, count in counts.items()) or "no primitives",
+        *_others("clutter", world.clutter),
+        *_others("structure", world.structure),
+    ]
+    return ", ".join(said)
+
+
+def _others(what: str, solids: Sequence[Solid]) -> list[str]:
+    """Say what there is beside primitives; an empty list where there is nothing."""
+    counts = Counter(solid.name for solid in solids)
+    names = ", ".join(name if count == 1 else f"{count} x {name}" for name, count in counts.items())
+    return [f"{len(solids)} of {what} ({names})"] if solids else []
+
+
+def _faults(options: SessionOptions) -> list[str]:
+    """Say what faults the scanner has, in the command line's words and units."""
+    faults = options.lidar.faults
+    said = {
+        "range bias": (faults.range_bias, f"{faults.range_bias * MM_PER_M:g} mm"),
+        "beam width": (faults.beam_width, f"{math.degrees(faults.beam_width):g} degrees"),
+        "quantum": (faults.quantum, f"{faults.quantum * MM_PER_M:g} mm"),
+        "dropouts": (faults.dropouts, f"{faults.dropouts:g} as {faults.dropout_as}"),
+        "outliers": (faults.outliers, f"{faults.outliers:g}"),
+        "noise growth": (faults.noise_growth, f"{faults.noise_growth * MM_PER_M:g} mm/m"),
+    }
+    return [f"{name} {text}" for name, (value, text) in said.items() if value]
 
 
 def main() -> None:

@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Collection, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any, TypedDict, Unpack
 
 from prim.errors import UsageError
 from prim.shapes import Kind
+from recorder.faults import DROPOUT_VALUES, ScannerFaults
 from recorder.odometry import OdometryNoise
+from recorder.rooms import ELEMENTS, SHAPES
 from recorder.sensors import Compass, Gps, Lidar
 from recorder.session import SessionOptions
 from recorder.world import WorldOptions
@@ -26,12 +29,19 @@ MAX_LENGTH = 1e6
 LARGEST = {
     "noise": 1e3,
     "noise_std": 1e3,
+    "range_bias": 1e3,
+    "quantum": 1e2,
+    "dropout": 1.0,
+    "outliers": 1.0,
+    "noise_growth": 1e2,
     "gps_noise": 1e6,
     "compass_noise": 1e3,
     "odom_noise": 1e3,
     "speed": 10.0,
     "rays": 1e6,
     "per_kind": 1e4,
+    "clutter": 1e3,
+    "at_walls": 1e3,
     "stops": 1e5,
     "size": MAX_LENGTH,
     "range_min": MAX_LENGTH,
@@ -41,6 +51,9 @@ LARGEST = {
 
 SMALLEST = {"size": 1e-2, "speed": 1e-4}
 """The smallest value of options (m, m/s) that else need only be above 0; set by hand."""
+
+MAX_BEAM_WIDTH = math.radians(30)
+"""A beam is no wider (rad); set by hand."""
 
 MAX_SHOWN = 10**300
 """Whole numbers beyond are not written out."""
@@ -52,6 +65,9 @@ FULL_TURN, ROUNDING = 2 * math.pi, 1e-9
 
 ALL_KINDS = "all"
 
+BOX_ROOM = "box"
+"""The room that is nothing but the walls along the floor's edges."""
+
 
 class RecordingKeywords(TypedDict, total=False):
     """What may be given of a recording; what is not given, or None, is as on the command line.
@@ -62,7 +78,7 @@ class RecordingKeywords(TypedDict, total=False):
     seed: int
     """The same seed and options write the same bytes."""
     world: str | Path | None
-    """A file that describes the world; it excludes size, walls, kinds and per_kind."""
+    """A file that describes the world; it excludes all that is drawn, from size to touching."""
     size: tuple[float, float] | None
     """The floor, along x and y."""
     walls: bool | None
@@ -71,6 +87,15 @@ class RecordingKeywords(TypedDict, total=False):
     """The kinds of primitives to draw: a list, or separated by commas; or «all»."""
     per_kind: int | tuple[int, int] | None
     """How many of each kind: a number, or fewest and most."""
+    clutter: int | tuple[int, int] | None
+    """How many things that are none of the kinds: a number, or fewest and most."""
+    room: Sequence[str] | str | None
+    """What the room is and has: «box», «round», «corridor» or «L»; «doorways», «pilasters», «furniture»; a list, or
+    separated by commas."""
+    at_walls: float | None
+    """How far from a wall every primitive stands; 0: it touches it."""
+    touching: bool
+    """Whether primitives stand in pairs that touch each other; it excludes at_walls."""
     motion: str
     """«warp»: the robot is set on a grid of positions; «drive»: it drives."""
     stops: tuple[int, int] | None
@@ -95,6 +120,20 @@ class RecordingKeywords(TypedDict, total=False):
     """Standard deviation of the range noise as a share of 5 m, the paper's unit."""
     noise_std: float | None
     """Standard deviation of the range noise (m); it excludes noise."""
+    range_bias: float
+    """What is added to each range."""
+    beam_width: float
+    """Full angular width of a beam (rad); at edges it lights several surfaces."""
+    quantum: float
+    """Ranges are rounded to whole multiples of this."""
+    dropout: float
+    """The share of beams that return nothing."""
+    dropout_as: str | None
+    """What is written for them: «inf», «nan», «0», or «max», the longest range."""
+    outliers: float
+    """The share of beams whose range is uniform between the limits."""
+    noise_growth: float
+    """Standard deviation of a further noise per metre of distance."""
     gps_noise: float
     """Standard deviation of GPS positions (m)."""
     compass_noise: float
@@ -104,7 +143,7 @@ class RecordingKeywords(TypedDict, total=False):
 PARAMETERS = frozenset(RecordingKeywords.__annotations__)
 """The names of all keywords."""
 
-SWITCHES = frozenset({"walls", "movable"})
+SWITCHES = frozenset({"walls", "movable", "touching"})
 """Those that are true or false."""
 
 
@@ -128,12 +167,27 @@ def recording_options(**keywords: Unpack[RecordingKeywords]) -> SessionOptions:
         given["noise_std"] = PAPER_NOISE_UNIT * given["noise"]
     options = SessionOptions(
         world=WorldOptions(**_some({**given, **converted}, _DRAWN)),
-        lidar=Lidar(**_some(given, _LIDAR)),
+        lidar=Lidar(**_some(given, _LIDAR), faults=_faults(given)),
         **_some(given, _DIRECT),
         **{_FIELDS[name]: value for name, value in converted.items() if name in _FIELDS},
     )
     _check_scanner(options)
     return options
+
+
+def _faults(given: Mapping[str, Any]) -> ScannerFaults:
+    """Make the scanner's faults."""
+    written = given.get("dropout_as")
+    if written is not None and written not in DROPOUT_VALUES:
+        raise UsageError(f"--dropout-as {written}: it is one of {', '.join(DROPOUT_VALUES)}")
+    if written is not None and not given.get("dropout"):
+        raise UsageError("--dropout-as needs --dropout, above 0")
+    bias = given.get("range_bias", 0.0)
+    if not abs(bias) <= LARGEST["range_bias"]:
+        largest = LARGEST["range_bias"]
+        raise UsageError(f"--range-bias is {bias:g}: it must be from -{largest:g} to {largest:g}")
+    named = {_FAULTS[name]: given[name] for name in _FAULTS if name in given}
+    return ScannerFaults(**named)
 
 
 def _some(given: Mapping[str, Any], names: Collection[str]) -> dict[str, Any]:
@@ -146,12 +200,24 @@ def _check_combinations(given: Mapping[str, Any]) -> None:
     motion = given.get("motion", SessionOptions.motion)
     if motion not in ("warp", "drive"):
         raise UsageError(f"--motion {motion}: it is warp or drive")
-    drawn = [name for name in _DRAWN if name in given]
+    drawn = [name for name in _DRAWN if name in given and (name != "touching" or given[name])]
     if "world" in given and drawn:
-        raise UsageError("--world excludes --size, --no-walls, --kinds and --per-kind: the file says it all")
+        raise UsageError(
+            f"--world excludes {'--no-walls' if drawn[0] == 'walls' else _option(drawn[0])}: the file says it all"
+        )
+    _check_walls(given)
     _refuse(given, _WARPED if motion == "drive" else _DRIVEN, motion)
     if "noise" in given and "noise_std" in given:
         raise UsageError("--noise and --noise-std say the same in two units: give one of them")
+
+
+def _check_walls(given: Mapping[str, Any]) -> None:
+    """Raise UsageError where a world is to be drawn that cannot be."""
+    if given.get("at_walls") is not None and given.get("touching"):
+        raise UsageError("--at-walls and --touching exclude each other")
+    for name in ("room", "at_walls"):
+        if name in given and given.get("walls") is False:
+            raise UsageError(f"{_option(name)} does not go with --no-walls")
 
 
 def _refuse(given: Mapping[str, Any], names: Collection[str], motion: str) -> None:
@@ -193,6 +259,9 @@ def _check_scanner(options: SessionOptions) -> None:
     if scans / rate > MAX_SECONDS:
         what = "--duration" if options.motion == "drive" else "--stops over --rate"
         raise UsageError(f"{what} gives a session of {scans / rate:g} s: it must not be above {MAX_SECONDS:g} s")
+    if (width := lidar.faults.beam_width) > MAX_BEAM_WIDTH:
+        said = f"{math.degrees(width):g} degrees, {width:g} rad"
+        raise UsageError(f"--beam-width is {said}: it must be from 0 to {math.degrees(MAX_BEAM_WIDTH):g} degrees")
     if lidar.fov > FULL_TURN * (1 + ROUNDING):
         turn = f"{math.degrees(lidar.fov):g} degrees, {lidar.fov:g} rad"
         raise UsageError(f"--fov is more than a full turn: {turn}")
@@ -208,12 +277,26 @@ def _kinds(listed: Sequence[str] | str) -> tuple[Kind, ...]:
     return tuple(Kind(name) for name in listed)
 
 
-def _per_kind(counts: int | tuple[int, int]) -> tuple[int, int]:
+def _room(listed: Sequence[str] | str) -> tuple[str, ...]:
+    """Return the names of what a room has beside its outer walls, in the order in which it is drawn."""
+    names = [name.strip() for name in (listed.split(",") if isinstance(listed, str) else listed)]
+    known = (BOX_ROOM, *SHAPES, *ELEMENTS)
+    unknown = [name for name in names if name not in known]
+    if unknown or not names:
+        what = f"{', '.join(unknown) or 'nothing'} is nothing of a room"
+        raise UsageError(f"--room {','.join(names)}: {what}, which is or has {','.join(known)}")
+    shapes = [name for name in known if name in names and name not in ELEMENTS]
+    if len(shapes) > 1:
+        raise UsageError(f"--room {','.join(names)}: a room is one of {','.join(known[: len(SHAPES) + 1])}")
+    return tuple(name for name in known if name in names and name != BOX_ROOM)
+
+
+def _counts(name: str, counts: int | tuple[int, int]) -> tuple[int, int]:
     fewest, most = (counts, counts) if isinstance(counts, int) else counts
     if not 0 <= fewest <= most:
-        raise UsageError(f"--per-kind {fewest}-{most} is not a range from small to large")
-    if most > LARGEST["per_kind"]:
-        raise UsageError(f"--per-kind is {_plain(most)}: it must be from 0 to {LARGEST['per_kind']:g}")
+        raise UsageError(f"{_option(name)} {fewest}-{most} is not a range from small to large")
+    if most > LARGEST[name]:
+        raise UsageError(f"{_option(name)} is {_plain(most)}: it must be from 0 to {LARGEST[name]:g}")
     return fewest, most
 
 
@@ -221,17 +304,38 @@ def _option(name: str) -> str:
     return f"--{name.replace('_', '-')}"
 
 
-_DRAWN = ("size", "walls", "kinds", "per_kind")
+_DRAWN = ("size", "walls", "kinds", "per_kind", "clutter", "room", "at_walls", "touching")
 _DRIVEN = ("duration", "speed", "movable", "odom_noise")
 _WARPED = ("stops",)
 _LIDAR = ("rays", "fov", "range_min", "range_max", "noise_std")
+_FAULTS = {
+    **{name: name for name in ("range_bias", "beam_width", "quantum", "dropout_as", "outliers", "noise_growth")},
+    "dropout": "dropouts",
+}
+"""The fields of the scanner's faults by the names of their parameters."""
 _DIRECT = ("seed", "motion", "stops", "duration", "speed", "movable", "rate")
 _POSITIVE = ("size", "stops", "duration", "speed", "rate", "rays", "fov", "range_max")
-_NOT_NEGATIVE = ("range_min", "noise", "noise_std", "gps_noise", "compass_noise", "odom_noise", "seed")
+_NOT_NEGATIVE = (
+    "range_min",
+    "noise",
+    "noise_std",
+    "gps_noise",
+    "compass_noise",
+    "odom_noise",
+    "seed",
+    "at_walls",
+    "beam_width",
+    "quantum",
+    "dropout",
+    "outliers",
+    "noise_growth",
+)
 
 _CONVERTED: Mapping[str, Callable[[Any], Any]] = {
     "kinds": _kinds,
-    "per_kind": _per_kind,
+    "per_kind": partial(_counts, "per_kind"),
+    "clutter": partial(_counts, "clutter"),
+    "room": _room,
     "world": Path,
     "gps_noise": Gps,
     "compass_noise": Compass,

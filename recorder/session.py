@@ -43,11 +43,13 @@ from prim.log.messages import (
 from prim.log.writer import RECORDED_LOG, LogWriter
 from prim.se2 import Pose2D
 from prim.world import World
+from recorder.faults import NO_FAULTS, FaultGenerators
 from recorder.motion import ExplorerOptions, Step, drive, warp
 from recorder.odometry import Odometry, OdometryNoise
+from recorder.placement import PlacementOptions
 from recorder.sensors import Compass, Gps, Lidar
 from recorder.simulator import Simulator, SimulatorOptions
-from recorder.world import PlacementOptions, WorldOptions, draw_world
+from recorder.world import OtherGenerators, WorldOptions, draw_world
 
 START = 1_735_689_600_000_000_000
 """The first stamp of every session (ns), 2025-01-01: a session must be the same whenever it is recorded."""
@@ -129,7 +131,10 @@ class Session:
 
 @dataclass(frozen=True)
 class _Generators:
-    """A random generator for each cause of chance, so that more of one never changes another."""
+    """A random generator for each cause of chance, so that more of one never changes another.
+
+    New ones come last: the others then draw what they always drew.
+    """
 
     world: np.random.Generator
     motion: np.random.Generator
@@ -137,6 +142,11 @@ class _Generators:
     gps: np.random.Generator
     compass: np.random.Generator
     odometry: np.random.Generator
+    room: np.random.Generator
+    clutter: np.random.Generator
+    beam: np.random.Generator
+    outliers: np.random.Generator
+    dropouts: np.random.Generator
 
     @classmethod
     def from_seed(cls, seed: int) -> _Generators:
@@ -171,7 +181,8 @@ def record_session(
         check_no_input([options.world_file], [path])
         world = World.load(options.world_file)
     else:
-        world = draw_world(generators.world, options.world, options.placement)
+        others = OtherGenerators(generators.room, generators.clutter)
+        world = draw_world(generators.world, options.world, options.placement, others)
     check_output(path, RECORDED_LOG, force)
     steps = _steps(Simulator(world, options.movable, options.simulator), options, generators.motion)
     first = next(steps, None)
@@ -229,7 +240,8 @@ class _StepWriter:
         log.write(ODOM_TOPIC, stamp, encode_odometry(stamp, odometry))
         log.write(TF_TOPIC, stamp, encode_transforms([(stamp, ODOM_FRAME, BASE_FRAME, odometry)]))
         log.write(TRUE_POSE_TOPIC, stamp, encode_pose(stamp, pose))
-        scan = options.lidar.measure(step.world, pose, stamp, 1 / options.rate, generators.lidar)
+        chances = FaultGenerators(generators.beam, generators.outliers, generators.dropouts)
+        scan = options.lidar.measure(step.world, pose, stamp, 1 / options.rate, generators.lidar, chances)
         log.write(SCAN_TOPIC, stamp, encode_scan(scan))
 
 
@@ -239,6 +251,8 @@ _ONLY_FOR = {"warp": ("stops",), "drive": ("duration", "speed", "movable", "odom
 _UNLESS_DEFAULT = ("simulator", "explorer", "placement")
 """Options that are described only where they are not the defaults."""
 
+_NEWER_WORLD_OPTIONS = ("clutter", "room", "at_walls", "touching")
+"""Options of a drawn world that are described only where they are not the defaults."""
 
 _SIMULATOR_KEYS = {"track_width": "axle"}
 """Metadata keys of the simulator's options where they are not the fields' names."""
@@ -249,6 +263,11 @@ def _describe(options: SessionOptions) -> dict[str, str]:
     described = asdict(options)
     noise = options.odometry
     described["odometry"] = {"metres": noise.translation_std, "radians": noise.rotation_std}
+    for name in _NEWER_WORLD_OPTIONS:
+        if getattr(options.world, name) == getattr(WorldOptions(), name):
+            del described["world"][name]
+    if options.lidar.faults == NO_FAULTS:
+        del described["lidar"]["faults"]
     described["simulator"] = {_SIMULATOR_KEYS.get(name, name): v for name, v in described["simulator"].items()}
     for name in _ONLY_FOR["warp" if options.motion == "drive" else "drive"]:
         del described[name]

@@ -10,7 +10,9 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, replace
 
+import numpy as np
 import pymunk
+import shapely
 
 from prim.se2 import Pose2D
 from prim.shapes import Primitive
@@ -64,7 +66,7 @@ class Simulator:
     """A world's bodies and the robot, which is put anywhere by a supervisor or drives by its wheels.
 
     Args:
-        world: The primitives and walls at the start.
+        world: All that stands there at the start; primitives alone can move.
         movable: Whether the robot can push the primitives.
         options: The physics.
     """
@@ -76,10 +78,13 @@ class Simulator:
         self._space.iterations = options.iterations
         self._space.collision_slop, self._space.collision_bias = options.overlap, options.overlap_after_a_second
         self._bodies = [self._add_primitive(primitive, movable) for primitive in world.primitives]
-        for x0, y0, x1, y1 in world.walls:
+        edges = [solid.as_segments() for solid in world.solids]
+        for x0, y0, x1, y1 in np.vstack([np.asarray(world.walls).reshape(-1, 4), *edges]).tolist():
             wall = pymunk.Segment(self._space.static_body, (x0, y0), (x1, y1), 0.0)
             wall.friction = options.contact_friction
             self._space.add(wall)
+        self._solid = shapely.union_all([shapely.Polygon(solid.outline) for solid in world.solids])
+        shapely.prepare(self._solid)
         inertia = pymunk.moment_for_circle(options.robot_mass, 0, options.robot_radius)
         self._robot = pymunk.Body(options.robot_mass, inertia)
         self._disc = pymunk.Circle(self._robot, options.robot_radius)
@@ -92,7 +97,7 @@ class Simulator:
         self._robot.position, self._robot.angle = (pose.x, pose.y), pose.theta
         self._robot.velocity, self._robot.angular_velocity = (0.0, 0.0), 0.0
         self._disc.cache_bb()
-        return not self._space.shape_query(self._disc)
+        return not self._is_inside(pose.x, pose.y) and not self._space.shape_query(self._disc)
 
     def clearance(self, x: float, y: float, reach: float) -> float:
         """Compute the distance from a point to the nearest thing that cannot move.
@@ -105,8 +110,14 @@ class Simulator:
         Returns:
             The distance (m), negative inside a thing, at most ``reach``.
         """
+        if self._is_inside(x, y):
+            return -float(self._solid.boundary.distance(shapely.Point(x, y)))
         found = self._space.point_query((x, y), reach, pymunk.ShapeFilter())
         return min((hit.distance for hit in found if _is_static(hit.shape)), default=reach)
+
+    def _is_inside(self, x: float, y: float) -> bool:
+        """Return whether a point lies inside clutter or structure, of which the space holds the edges alone."""
+        return bool(shapely.contains_xy(self._solid, x, y))
 
     @property
     def pose(self) -> Pose2D:

@@ -1,18 +1,24 @@
-"""Random worlds as the paper draws them (III-B): mixed primitives on a floor of 2 x 2 m, no two overlapping."""
+"""Random worlds as the paper draws them (III-B): mixed primitives on a floor of 2 x 2 m, no two overlapping.
+
+Beside them a world may hold clutter, things that are none of the kinds, and be another room than a box.
+"""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
-from itertools import islice
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 import shapely
 
 from prim.errors import UsageError
 from prim.shapes import Kind, Primitive
-from prim.world import World
+from prim.world import Solid, World
+from recorder.clutter import draw_thing, put_anywhere
+from recorder.placement import DEFAULTS, Ground, PlacementOptions, beside
+from recorder.rooms import draw_room
 
 
 @dataclass(frozen=True)
@@ -24,95 +30,151 @@ class WorldOptions:
         kinds: The kinds of primitives that are drawn.
         per_kind: Fewest and most primitives of each kind.
         walls: Whether there is a wall along each edge of the floor.
+        clutter: Fewest and most things that are none of the kinds.
+        room: What the room has beside walls along the floor's edges: names of :mod:`recorder.rooms`.
+        at_walls: How far from a wall every primitive stands (m); None: anywhere.
+        touching: Whether primitives stand in pairs that touch each other.
     """
 
     size: tuple[float, float] = (2.0, 2.0)
     kinds: tuple[Kind, ...] = tuple(Kind)
     per_kind: tuple[int, int] = (0, 2)
     walls: bool = True
+    clutter: tuple[int, int] = (0, 0)
+    room: tuple[str, ...] = ()
+    at_walls: float | None = None
+    touching: bool = False
 
 
 @dataclass(frozen=True)
-class PlacementOptions:
-    """How primitives are placed: by rejection sampling; all set by hand.
+class OtherGenerators:
+    """What draws all of a world but the primitives, so that these are the same without it where it leaves them room.
 
     Attributes:
-        gap: Least distance of primitives from each other and from the floor's edge (m).
-        tries_per_primitive: Places that are tried for one primitive before the world is drawn anew.
-        tries: Places that are tried in all.
+        room: Draws the room.
+        clutter: Draws the clutter.
     """
 
-    gap: float = 0.03
-    tries_per_primitive: int = 200
-    tries: int = 20_000
+    room: np.random.Generator
+    clutter: np.random.Generator
 
-
-DEFAULTS = PlacementOptions()
 
 AMPLE_SPACING = 0.6
 """Primitives that have squares of this side (m) on average find places; set by hand."""
 
 
-def draw_world(rng: np.random.Generator, options: WorldOptions, placement: PlacementOptions = DEFAULTS) -> World:
-    """Draw a world.
+def draw_world(
+    rng: np.random.Generator,
+    options: WorldOptions,
+    placement: PlacementOptions = DEFAULTS,
+    others: OtherGenerators | None = None,
+) -> World:
+    """Draw a world: the room, primitives in it, and clutter where it finds room among them.
 
     Args:
-        rng: Draws it.
+        rng: Draws the primitives.
         options: What it holds.
-        placement: How its primitives are placed.
+        placement: How all that is drawn is placed.
+        others: Draw the rest; None: children of ``rng``.
 
     Returns:
         The world.
 
     Raises:
-        UsageError: The primitives do not fit on the floor.
+        UsageError: The primitives, the clutter or the room's elements do not fit on the floor.
     """
+    others = others or OtherGenerators(*rng.spawn(2))
     tries = iter(range(placement.tries))
-    while True:
+    attempts = placement.worlds if options.room or options.clutter[1] else placement.tries
+    for _ in range(attempts):
         fewest, most = options.per_kind
         kinds = [kind for kind in options.kinds for _ in range(rng.integers(fewest, most, endpoint=True))]
-        primitives = _place(rng, kinds, options.size, placement, tries)
-        if primitives is not None:
-            world = World(options.size, tuple(primitives))
-            return world.with_walls() if options.walls else world
+        room = draw_room(others.room, options.size, options.room)
+        pieces = [shapely.Polygon(solid.outline) for solid in room.structure]
+        ground = Ground(options.size, pieces, room.walls, placement, tries)
+        primitives = _place(rng, kinds, ground, options)
+        clutter = None if primitives is None else _scatter(others.clutter, options.clutter, ground)
+        if primitives is not None and clutter is not None:
+            world = World(options.size, tuple(primitives), (), tuple(clutter), room.structure)
+            world = world.with_walls() if options.walls else world
+            return replace(world, walls=world.walls + room.walls)
         if next(tries, None) is None:
-            width, height = options.size
-            raise UsageError(
-                f"{most} of each of {len(options.kinds)} kinds do not fit on {width:g} x {height:g} m: "
-                f"give {_larger_floor(options)} or a smaller --per-kind"
-            )
+            break
+    raise UsageError(_does_not_fit(options))
+
+
+def _does_not_fit(options: WorldOptions) -> str:
+    width, height = options.size
+    clutter = options.clutter[1]
+    others = f" and {clutter} of clutter" if clutter else ""
+    room = " in such a room" if options.room else ""
+    return (
+        f"{options.per_kind[1]} of each of {len(options.kinds)} kinds{others} do not fit on {width:g} x {height:g} m"
+        f"{room}: give {_larger_floor(options)} or a smaller --per-kind"
+    )
 
 
 def _larger_floor(options: WorldOptions) -> str:
-    """Return the option that makes the floor, enlarged in its form, large enough for all primitives."""
+    """Return the option that makes the floor, enlarged in its form, large enough for all that is drawn."""
     width, height = options.size
-    growth = AMPLE_SPACING * math.sqrt(options.per_kind[1] * len(options.kinds) / (width * height))
+    most = options.per_kind[1] * len(options.kinds) + options.clutter[1]
+    growth = AMPLE_SPACING * math.sqrt(most / (width * height)) * (2 if options.room else 1)
     return "--size " + " ".join(f"{math.ceil(max(growth * side, AMPLE_SPACING, side))}" for side in options.size)
 
 
 def _place(
-    rng: np.random.Generator,
-    kinds: Sequence[Kind],
-    size: tuple[float, float],
-    placement: PlacementOptions,
-    tries: Iterator[int],
+    rng: np.random.Generator, kinds: Sequence[Kind], ground: Ground, options: WorldOptions
 ) -> list[Primitive] | None:
-    """Draw primitives of these kinds, apart from each other; None where one found no place or no tries are left."""
-    placed: list[Primitive] = []
-    outlines: list[shapely.Polygon] = []
-    gap = placement.gap
-    floor = shapely.box(-size[0] / 2, -size[1] / 2, size[0] / 2, size[1] / 2).buffer(-gap, join_style="mitre")
+    """Draw primitives of these kinds; None where one found no place."""
+    if options.touching:
+        return _place_pairs(rng, [kinds[i] for i in rng.permutation(len(kinds))], ground)
+    at_walls = options.at_walls
+    settle = None if at_walls is None else lambda primitive: ground.to_wall(rng, primitive, at_walls)
+    placed = []
     for kind in kinds:
-        for _ in islice(tries, placement.tries_per_primitive):
-            primitive = draw_primitive(rng, kind, size)
-            outline = shapely.Polygon(primitive.outline())
-            if floor.contains(outline) and all(outline.distance(other) >= gap for other in outlines):
-                placed.append(primitive)
-                outlines.append(outline)
+        primitive = ground.put(partial(draw_primitive, rng, kind, ground.size), Primitive.outline, settle)
+        if primitive is None:
+            return None
+        placed.append(primitive)
+    return placed
+
+
+def _place_pairs(rng: np.random.Generator, kinds: Sequence[Kind], ground: Ground) -> list[Primitive] | None:
+    """Draw primitives of which each second one touches the one before it; None where one found no place."""
+    placed: list[Primitive] = []
+    for index, kind in enumerate(kinds):
+        draw = partial(draw_primitive, rng, kind, ground.size)
+        if index % 2:
+            primitive = ground.put(
+                partial(_draw_beside, rng, draw, placed[-1], ground.placement), Primitive.outline, None, ground.latest
+            )
+        else:
+            primitive = ground.put(draw, Primitive.outline)
+        if primitive is None:
+            return None
+        placed.append(primitive)
+    return placed
+
+
+def _draw_beside(
+    rng: np.random.Generator, draw: Callable[[], Primitive], other: Primitive, placement: PlacementOptions
+) -> Primitive:
+    return beside(rng, draw(), other, placement)
+
+
+def _scatter(rng: np.random.Generator, counts: tuple[int, int], ground: Ground) -> list[Solid] | None:
+    """Draw clutter, apart from all that stands there; None where it found no place."""
+    scattered: list[Solid] = []
+    for _ in range(rng.integers(*counts, endpoint=True)):
+        for _ in range(ground.placement.things):
+            name, outline = draw_thing(rng)
+            placed = ground.put(partial(put_anywhere, rng, outline, ground.size), np.asarray)
+            if placed is not None:
+                scattered.append(Solid.of(name, placed))
                 break
         else:
             return None
-    return placed
+    return scattered
 
 
 def draw_primitive(rng: np.random.Generator, kind: Kind, size: tuple[float, float]) -> Primitive:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import AbstractContextManager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from numbers import Real
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Unpack
@@ -35,6 +35,7 @@ from replay.mapping.stage import blames_log_for_size
 from replay.notes import pluralize
 from replay.options import ReplayOptions
 from replay.outputs.exports import log_stem, write_map, write_report, write_trajectory
+from replay.outputs.found_objects import FoundObject, found_objects
 from replay.outputs.found_primitives import FoundPrimitive, found_primitives
 from replay.outputs.report import report_json
 from replay.pipeline import Pipeline
@@ -74,6 +75,7 @@ class Result:
 
     Attributes:
         primitives: The primitives in the map, highest score first.
+        objects: What is likeliest none of the kinds, highest score first; never counted among the primitives.
         grid: The map: ``grid.probability`` (rows, cols), 0.5 where unknown, row 0 at the smallest y; ``grid.frame``
             says where it lies.
         poses: Where the laser was.
@@ -85,6 +87,7 @@ class Result:
     """
 
     primitives: tuple[FoundPrimitive, ...]
+    objects: tuple[FoundObject, ...]
     grid: OccupancyGrid
     poses: LaserTrajectory
     truth: tuple[Primitive, ...]
@@ -97,6 +100,8 @@ class Result:
     def __repr__(self) -> str:
         rows, cols = self.grid.frame.shape
         found, scans = pluralize(len(self.primitives), "primitive"), pluralize(len(self.poses.stamps), "scan")
+        if self.objects:
+            found += f" and {pluralize(len(self.objects), 'object')} of no kind"
         mapper, source = self._replayed.options.mapper, self.poses.source
         return f"Result({found} in {cols} x {rows} cells of {mapper}, {scans}, poses: {source})"
 
@@ -107,10 +112,10 @@ class Result:
         return primitives_table(self.primitives)
 
     def plot(self) -> Picture:
-        """Draw the map, the primitives, and in grey the true ones, where they are known."""
+        """Draw the map, the primitives, and in greys the objects of no kind and the true primitives, where known."""
         from replay.outputs.picture import draw_picture
 
-        return draw_picture(self.grid, self.primitives, self.truth)
+        return draw_picture(self.grid, self.primitives, self.truth, self.objects)
 
     def save(self, directory: str | Path, force: bool = False) -> list[Path]:
         """Write the report, the map for nav2, the poses in TUM's format and the picture into a folder.
@@ -290,6 +295,7 @@ def refine(
     scans: Iterable[tuple[Scan, Pose2D]],
     grid: OccupancyGrid,
     noise_std: float | None = None,
+    closed_world: bool = False,
 ) -> list[FoundPrimitive | None]:
     """Fit primitives to the rays of scans by maximum likelihood: guesses of any detector become estimates.
 
@@ -300,10 +306,12 @@ def refine(
         scans: The scans with the laser's poses, as :func:`posed_scans` yields them.
         grid: A map of these scans.
         noise_std: Standard deviation of the range noise (m); None to estimate it.
+        closed_world: Whether every guess is taken to be one of the kinds, if anything.
 
     Returns:
         For each guess, in their order, the likeliest primitive with its standard deviations, its id the guess's
-        number from 1 on; None where the rays contradict it, or where it overlaps one before it.
+        number from 1 on; None where the rays contradict it, where what stands there is likeliest none of the kinds,
+        or where it overlaps one before it.
 
     Raises:
         UsageError: An argument is of another kind, or the noise is not above 0.
@@ -313,19 +321,22 @@ def refine(
     from detect.refinement.surroundings.map_cells import MapCells
 
     guesses, noise_std = _checked_guesses(primitives), _checked_noise(noise_std)
+    if not isinstance(closed_world, bool):
+        raise UsageError(f"closed_world is {closed_world!r}: it must be True or False")
     if not isinstance(grid, OccupancyGrid):
         raise UsageError(f"grid is {type(grid).__name__}: give a map, such as result.grid")
     fitted = [
         k for k, guess in enumerate(guesses) if not _overlaps(guess, guesses[:k], DEFAULTS.acceptance.max_shared)
     ]
     cells = MapCells.of(grid, DEFAULTS.map, DEFAULTS.lines)
-    found = Refinement(cells, noise_std, cores()).run([guesses[k] for k in fitted], _checked_pairs(scans))
-    of_guess = dict(zip(fitted, found, strict=True))
-    fits = [of_guess.get(k) for k in range(len(guesses))]
-    return [
-        None if fit is None or rejection_reason(fit) else FoundPrimitive.of(detection_of(fit), number)
-        for number, fit in enumerate(fits, 1)
-    ]
+    options = replace(DEFAULTS, closed_world=closed_world)
+    refinement = Refinement(cells, noise_std, cores(), options=options)
+    fits = refinement.run([guesses[k] for k in fitted], _checked_pairs(scans))
+    found: list[FoundPrimitive | None] = [None] * len(guesses)
+    for k, fit in zip(fitted, fits, strict=True):
+        if fit is not None and not rejection_reason(fit) and not fit.is_other:
+            found[k] = FoundPrimitive.of(detection_of(fit), k + 1)
+    return found
 
 
 def _overlaps(guess: Primitive, others: Iterable[Primitive], limit: float) -> bool:
@@ -408,6 +419,7 @@ def _as_result(result: ReplayResult) -> Result:
     notes = (*result.notes, *(f"detection skipped: {reason}" for reason in [result.detection_skipped] if reason))
     return Result(
         primitives=found_primitives(result.detections),
+        objects=found_objects(result.detections),
         grid=result.grid,
         poses=LaserTrajectory(stamps, poses.poses[valid], covariances, poses.source, poses.matched),
         truth=result.detections.truth if result.detections else (),

@@ -155,6 +155,10 @@ def replay(
     no_refine: Annotated[
         bool, typer.Option("--no-refine", help="Keep the networks' estimates: no fit to the rays.")
     ] = False,
+    closed_world: Annotated[
+        bool,
+        typer.Option("--closed-world", help="Take all that stands there to be one of the kinds, or a wall."),
+    ] = False,
     weights: Annotated[
         Path | None,
         typer.Option(metavar="W.onnx", help="The detector's YOLO network, or its folder. [default: prim's own]"),
@@ -211,7 +215,11 @@ def replay(
     as_json: Annotated[bool, typer.Option("--json", help="With --list: as JSON, an object for each log.")] = False,
     quiet: Annotated[bool, typer.Option("--quiet", help="Print errors only, and the addresses of --serve.")] = False,
     verbose: Annotated[
-        bool, typer.Option("--verbose", help="Report stage timings, and rejected candidates with the reasons.")
+        bool,
+        typer.Option(
+            "--verbose",
+            help="Report stage timings, and rejected candidates and objects of no kind with the reasons.",
+        ),
     ] = False,
     debug: Annotated[bool, typer.Option("--debug", help="Show tracebacks.")] = False,
     version: Annotated[
@@ -262,6 +270,7 @@ def replay(
         detect=not no_detect,
         detect_every=_parse_interval(detect_every),
         refine=not no_refine,
+        closed_world=closed_world,
         weights=weights,
         recover=recover,
     )
@@ -551,7 +560,7 @@ def _write_outputs(
 def _print_results(
     results: Sequence[ReplayResult], written: Sequence[Path], replaced: Sequence[Path], verbose: bool
 ) -> None:
-    """Print notes, rejected candidates if ``verbose``, the table, where the outputs are, and which were replaced."""
+    """Print notes, the table, where the outputs are, and which were replaced; if ``verbose`` what is no primitive."""
     from replay.result import distinct_notes
 
     for note in distinct_notes(results):
@@ -559,6 +568,7 @@ def _print_results(
     if verbose:
         for result in results:
             _print_rejected(result)
+            _print_objects(result)
     _print_tables(results, verbose)
     for name, paths in (("wrote", written), ("replaced", [path for path in replaced if path in written])):
         if paths:
@@ -574,6 +584,15 @@ def _print_rejected(result: ReplayResult) -> None:
     for rejection in rejections:
         what = f"{rejection.kind} at ({rejection.x:.2f}, {rejection.y:.2f}) m, score {rejection.score:.2f}"
         console.echo(f"rejected: {what}: {rejection.reason}", err=True)
+
+
+def _print_objects(result: ReplayResult) -> None:
+    """Print the objects that are none of the kinds, and why."""
+    from replay.outputs.found_objects import found_objects
+
+    for thing in found_objects(result.detections):
+        what = f"object {thing.id} at ({thing.x:.2f}, {thing.y:.2f}) m, score {thing.score:.2f}"
+        console.echo(f"no kind: {what}: {thing.reason}", err=True)
 
 
 def _print_tables(results: Sequence[ReplayResult], verbose: bool) -> None:

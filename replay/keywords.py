@@ -59,6 +59,7 @@ class ReplayKeywords(TypedDict, total=False):
     detect: bool
     detect_every: int | Literal["end"] | None
     refine: bool
+    closed_world: bool
     weights: str | Path | None
     recover: bool
 
@@ -66,7 +67,7 @@ class ReplayKeywords(TypedDict, total=False):
 PARAMETERS = frozenset(ReplayKeywords.__annotations__)
 """The names of all keywords."""
 
-SWITCHES = frozenset({"standing_still", "match_scans", "deskew", "detect", "refine", "recover"})
+SWITCHES = frozenset({"standing_still", "match_scans", "deskew", "detect", "refine", "closed_world", "recover"})
 """Those that are true or false."""
 
 _SELECTION = ("start", "end", "duration", "n_scans", "stride")

@@ -9,6 +9,8 @@ from typing import Final, Literal
 
 import numpy as np
 
+from detect.refinement.options import DEFAULTS as REFINEMENT
+from detect.refinement.options import RefinementOptions
 from mapping.mapper import check_cells, check_mapper, takes_noise
 from prim.choices import ClockName, MapperName, PoseSourceName, SensorModelName, SweepName
 from prim.errors import UsageError
@@ -69,6 +71,8 @@ class ReplayOptions:
         detect_every: N to detect primitives after the first scan, after every N scans, and at the end; «end» for the
             end only; None for eight times where the replay is shown, else the end only.
         refine: Whether detections are refined with the rays.
+        closed_world: Whether all that stands there is taken to be one of the kinds, or a wall; else what is likeliest
+            none of the kinds is an object without one.
         weights: The weights of the detector; None for those that come with prim.
         recover: Whether what is left of a damaged log is read.
 
@@ -100,6 +104,7 @@ class ReplayOptions:
     detect: bool = True
     detect_every: int | Literal["end"] | None = None
     refine: bool = True
+    closed_world: bool = False
     weights: Path | None = None
     recover: bool = False
 
@@ -119,6 +124,8 @@ class ReplayOptions:
             raise UsageError(f"--detect-every is {every}: it must be a number of scans, at least 1, or «{END}»")
         if not self.detect and (self.detect_every or self.weights or not self.refine):
             raise UsageError("--no-detect excludes --detect-every, --weights and --no-refine")
+        if self.closed_world and not (self.detect and self.refine):
+            raise UsageError("--closed-world is for refinement: it excludes --no-detect and --no-refine")
         if self.clock not in [*ClockName]:
             raise UsageError(f"--clock is {self.clock!r}: choose from {', '.join(ClockName)}")
         lowest, highest = self.height_slice or (0.0, 1.0)
@@ -136,6 +143,11 @@ class ReplayOptions:
     def scan_log(self) -> ScanLogOptions:
         """How scans are read."""
         return ScanLogOptions(self.scan_topic, self.clock, self.height_slice)
+
+    @property
+    def refinement(self) -> RefinementOptions:
+        """The numeric parameters of refinement."""
+        return replace(REFINEMENT, closed_world=self.closed_world)
 
     @property
     def mappers(self) -> tuple[str, ...]:

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from detect.detection import OTHER
 from mapping.grid import OccupancyGrid
 from mapping.map_metrics import MapScores
 from prim.arrays import FloatArray
@@ -23,6 +24,7 @@ from prim.text import printable
 from prim.world import World
 from replay.detection.stage import DetectionResult
 from replay.outputs.exports import APPLICATION, RECORDING
+from replay.outputs.found_objects import OBJECT_COLOR, FoundObject, found_objects
 from replay.result import ReplayResult
 from replay.viewer_layout import (
     ANGLE_ERROR,
@@ -41,6 +43,7 @@ from replay.viewer_layout import (
 )
 from replay.viewing.checks import check_display, check_viewer, local_address
 from replay.viewing.drawing import (
+    closed,
     confidence_ellipse,
     crop_sheet,
     occupancy_percent,
@@ -81,7 +84,7 @@ LASER_LENGTH, MAX_SCALE = 0.06, 10.0
 SCAN_COLOR = (255, 80, 60)
 TRAJECTORY_COLOR = (40, 110, 220)
 LASER_COLOR = (40, 110, 220)
-TRUTH_COLOR = (150, 150, 150)
+TRUTH_COLOR, TRUTH_OTHERS_COLOR = (150, 150, 150), (200, 200, 200)
 LABEL_COLOR = (255, 255, 255)
 
 BOUNDS_ALPHA = 130
@@ -175,6 +178,17 @@ class RerunViewer:
         if world.walls:
             strips = list(self._raised(np.asarray(world.walls).reshape(-1, 2, 2), TRUTH_HEIGHT))
             self._recording.log(f"{SCENE}/truth/walls", rr.LineStrips3D(strips, colors=[TRUTH_COLOR], radii=radius))
+        if world.solids:
+            self._recording.log(
+                f"{SCENE}/truth/others",
+                rr.LineStrips3D(
+                    [self._raised(closed(solid.outline), TRUTH_HEIGHT) for solid in world.solids],
+                    labels=[printable(solid.name) for solid in world.solids],
+                    show_labels=False,
+                    colors=[TRUTH_OTHERS_COLOR],
+                    radii=radius,
+                ),
+            )
 
     def show_scan(self, posed: PosedScan) -> None:
         """See :meth:`.Viewer.show_scan`."""
@@ -212,10 +226,13 @@ class RerunViewer:
         self._send_batch()
         self._set_time(position, stamp)
         found, layer = result.detections.found, self._layers[mapper]
+        objects = found_objects(result)
         table = rr.TextDocument(detections_markdown(result), media_type=rr.MediaType.MARKDOWN)
         self._recording.log(f"{layer}map/detections", self._outlines(found))
         self._recording.log(f"{layer}map/uncertainty", self._uncertainty_bounds(found))
         self._recording.log(f"{layer}map/labels", self._labels(result))
+        self._recording.log(f"{layer}map/objects", self._object_outlines(objects))
+        self._recording.log(f"{layer}map/objects/labels", self._object_labels(objects))
         self._recording.log(f"{layer}detections", table)
         self._recording.log(f"{layer}crops", rr.Image(crop_sheet(found)))
         errors = result.errors
@@ -344,6 +361,19 @@ class RerunViewer:
             radii=rr.Radius.ui_points(0.8),
         )
 
+    def _object_outlines(self, objects: Sequence[FoundObject]) -> Any:
+        """Draw the outlines of objects of no kind in grey."""
+        return rr.LineStrips3D(
+            [self._raised(closed(thing.outline), DETECTION_HEIGHT) for thing in objects],
+            colors=[OBJECT_COLOR],
+            radii=rr.Radius.ui_points(2.5),
+        )
+
+    def _object_labels(self, objects: Sequence[FoundObject]) -> Any:
+        """Write id and score above each object of no kind."""
+        labels = [f"{thing.id}: {OTHER} {thing.score:.2f}" for thing in objects]
+        return self._texts(labels, [(thing.x, float(thing.outline[:, 1].max())) for thing in objects])
+
     def _labels(self, result: DetectionResult) -> Any:
         """Write id, kind and score above each detection; «?» while its track is tentative."""
         labels, tops = [], []
@@ -351,8 +381,12 @@ class RerunViewer:
             primitive, mark = detection.primitive, "" if identity.confirmed else "?"
             labels.append(f"{identity.id}{mark}: {primitive.kind} {detection.score:.2f}")
             tops.append((primitive.x, float(ring(primitive)[:, 1].max())))
+        return self._texts(labels, tops)
+
+    def _texts(self, labels: Sequence[str], places: Sequence[tuple[float, float]]) -> Any:
+        """Write texts at places of the map (m)."""
         return rr.Points3D(
-            self._raised(np.array(tops).reshape(-1, 2), DETECTION_HEIGHT),
+            self._raised(np.array(places).reshape(-1, 2), DETECTION_HEIGHT),
             labels=labels,
             colors=[LABEL_COLOR],
             radii=rr.Radius.ui_points(0.0),

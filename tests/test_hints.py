@@ -87,6 +87,9 @@ RECORDINGS = {
     ),
     "many primitives": Recording("do not fit on", QUICK + "--per-kind 40 --stops 2 2"),
     "a small floor": Recording("do not fit on", QUICK + "--per-kind 1 --stops 2 2 --size 0.1 3"),
+    "much clutter": Recording("do not fit on", QUICK + "--per-kind 0 --clutter 100 --stops 2 2"),
+    "a small room": Recording("finds no place on", QUICK + "--per-kind 0 --room furniture --size 0.1 0.1"),
+    "a crowded room": Recording("do not fit on", QUICK + "--per-kind 4 --room L --size 1 1"),
 }
 
 

@@ -84,7 +84,7 @@ ENDS = {
     ("replay/detection", "detect/refinement/surroundings"): {"map_cells"},
     ("replay", "detect/refinement/surroundings"): {"map_cells"},
     ("replay/viewing", "replay"): {"result"},
-    ("replay/viewing", "replay/outputs"): {"report"},
+    ("replay/viewing", "replay/outputs"): {"report", "found_objects"},
     ("replay/scans", "replay"): {"notes", "timing"},
     ("replay/viewing", "replay/detection"): {"stage"},
     ("replay/mapping", "replay"): {"options", "timing"},
@@ -115,10 +115,13 @@ NUMBERS = {
         "COLUMNS BLOCK CHUNK SHIFT SPACING REACH TABLE_REACH TABLE_SPACING TABLE_MARGIN_CELLS PARAMETERS FIRST_ROOM "
         "ENTRY_RANGE MAX_RANGE COLLECTED_ROWS SCRATCH_ROWS BOX ROUND TRIANGLE POLYGON MEASURED TOO_NEAR NO_RETURN "
         "INVALID CENSORED_MOMENTS HITS PASSES SQUARES_OF_ARRIVAL SKIPPED HIT FREE OCCUPIED UNSEEN "
-        "USED REJECTED MIN_BLOCKS MAX_BLOCKS BLOCK_CELLS"
+        "USED REJECTED MIN_BLOCKS MAX_BLOCKS BLOCK_CELLS "
+        "OFFSET ALONG HIGH LOW ALONG_HIGH ALONG_LOW AT_HIGH AT_LOW NEAREST EDGE FARTHEST RANGE"
     ),
     "mathematics": "NORMAL_MAD NORMAL_MEDIAN EQUATORIAL_RADIUS FLATTENING OUTLINE_POINTS",
-    "rounding and the infinite": "FAR BEHIND ENDLESS EXACT POSITIVE NO_COUNTS TRANSMITTANCE_FLOOR BORDER_SLACK",
+    "rounding and the infinite": (
+        "FAR BEHIND ENDLESS EXACT POSITIVE NO_COUNTS LEAST_INCIDENCE TRANSMITTANCE_FLOOR BORDER_SLACK"
+    ),
     "definitions": "UNKNOWN_GREY WHITE_VISITS TOLERANCE_CELLS MAX_CELLS MIN_RESOLUTION MAX_RESOLUTION",
 }
 """The numeric constants that modules of algorithms may have beside their options."""

@@ -85,7 +85,7 @@ def _wild_world(rng: random.Random, data: bytes) -> tuple[str, bytes]:
         return wild_json(rng, "it", data)
     world = json.loads(data)
     count = rng.choice(MANY_PRIMITIVES)
-    how = rng.choice(("primitives", "walls"))
+    how = rng.choice(("primitives", "walls", "clutter"))
     world[how] = [rng.choice(world[how])] * count
     return f"{count} {how}", json.dumps(world).encode()
 

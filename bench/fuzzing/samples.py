@@ -12,6 +12,7 @@ from bench.fuzzing import mcap_file
 from prim.log.writer import LogWriter
 from recorder.sensors import Lidar
 from recorder.session import SessionOptions, record_session
+from recorder.world import WorldOptions
 from tests.encodings.content import LogContent, delayed, read_content
 from tests.encodings.ros2 import mcap_bytes
 from tests.encodings.table import ENCODINGS
@@ -91,7 +92,8 @@ def make_samples(seed: int = 0) -> Samples:
     with TemporaryDirectory(prefix="prim-fuzz-") as folder:
         place = Path(folder)
         lidar = Lidar(rays=RAYS, fov=math.pi, range_min=0.15, range_max=1.2)
-        options = SessionOptions(seed=seed, motion="drive", duration=SECONDS, lidar=lidar)
+        world = WorldOptions(clutter=(2, 2))
+        options = SessionOptions(seed=seed, motion="drive", duration=SECONDS, lidar=lidar, world=world)
         recorded = record_session(place / "recorded.mcap", options).path
         content = delayed(read_content(recorded))
         found = {"recorded": {"recorded.mcap": recorded.read_bytes()}}

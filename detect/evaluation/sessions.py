@@ -10,7 +10,7 @@ rejected in the end.
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any
@@ -29,6 +29,7 @@ from detect.evaluation.evaluate import (
 )
 from detect.networks.tiles import tile_frames, tile_image
 from detect.networks.yolo import KINDS, Boxes
+from detect.refinement.options import DEFAULTS as REFINEMENT
 from detect.refinement.refine import refine_detections
 from detect.training.dataset import (
     DatasetOptions,
@@ -92,7 +93,7 @@ class SessionScore:
 
 
 def evaluate_session(
-    seed: int, options: DatasetOptions, mapper: str, weights: Path
+    seed: int, options: DatasetOptions, mapper: str, weights: Path, closed_world: bool = False
 ) -> tuple[SessionScore, SessionScore]:
     """Record a session, map it, detect and refine.
 
@@ -101,16 +102,18 @@ def evaluate_session(
         options: How it is recorded.
         mapper: Name of the mapper.
         weights: Folder of the detector's weights.
+        closed_world: Whether refinement takes all that stands there to be one of the kinds, or a wall.
 
     Returns:
-        The score of the networks alone, and that after refinement.
+        The score of the networks alone, and that after refinement; objects of no kind count in neither.
     """
     world, scans = simulate_session(session_options(options, seed))
     frame = map_frame(world, options.resolution)
     grid = map_scans(mapper, scans, options.resolution, frame.bounds, threads=1)
     detector = _load_detector(weights, mapper)
     detections = detector.detect(grid)
-    refined, _ = refine_detections(detections, scans, grid, None, 1)
+    refinement = replace(REFINEMENT, closed_world=closed_world)
+    refined, _ = refine_detections(detections, scans, grid, None, 1, options=refinement)
     images = [
         LabelledImage(
             Sample(Path(), tile, primitives_in_tile(world.primitives, tile), 0.0),
@@ -126,7 +129,12 @@ def evaluate_session(
 
 
 def evaluate_sessions(
-    seeds: Sequence[int], options: DatasetOptions, mapper: str, weights: Path, jobs: int | None = None
+    seeds: Sequence[int],
+    options: DatasetOptions,
+    mapper: str,
+    weights: Path,
+    jobs: int | None = None,
+    closed_world: bool = False,
 ) -> dict[str, Any]:
     """Evaluate sessions in processes of one thread each; their number does not change the results.
 
@@ -136,11 +144,12 @@ def evaluate_sessions(
         mapper: Name of the mapper.
         weights: Folder of the detector's weights.
         jobs: Number of processes; None: one for each available core.
+        closed_world: As for :func:`evaluate_session`.
 
     Returns:
         Results as they are stored: ``networks`` (alone) and ``refined``, each as :func:`summarize_sessions`.
     """
-    evaluate = partial(evaluate_session, options=options, mapper=mapper, weights=weights)
+    evaluate = partial(evaluate_session, options=options, mapper=mapper, weights=weights, closed_world=closed_world)
     with process_pool(jobs) as pool:
         scores = list(pool.map(evaluate, seeds))
     networks, refined = zip(*scores, strict=True)

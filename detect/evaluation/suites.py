@@ -204,23 +204,40 @@ class RecordingCondition:
         name: One of RecordingMode.
         noise_mm: Standard deviation of the range noise (mm).
         options: How sessions are recorded.
+        closed_world: Whether refinement takes all that stands there to be one of the kinds, or a wall.
     """
 
     name: str
     noise_mm: int
     options: DatasetOptions
+    closed_world: bool = False
+
+    @property
+    def title(self) -> str:
+        """Its name in tables."""
+        return f"{self.name}, closed world" if self.closed_world else self.name
 
     @property
     def slug(self) -> str:
         """Its name in file names."""
-        return f"{self.name.replace(' ', '-')}-{self.noise_mm}"
+        closed = "-closed-world" if self.closed_world else ""
+        return f"{self.name.replace(' ', '-')}-{self.noise_mm}{closed}"
 
 
-def conditions(sessions: int) -> Iterator[RecordingCondition]:
-    """Yield all noise levels of warped sessions, and three of the other modes; ``sessions`` each."""
+def conditions(sessions: int, closed_world: bool = False) -> Iterator[RecordingCondition]:
+    """Yield the conditions that sessions are recorded under.
+
+    Args:
+        sessions: Number of sessions of each.
+        closed_world: Whether refinement takes all that stands there to be one of the kinds, or a wall.
+
+    Yields:
+        All noise levels of warped sessions, and three of each other mode.
+    """
     plain = DatasetOptions(sizes=(0, sessions), seed=300_000)
     for noise_mm in SHIPPED_NOISE:
-        yield RecordingCondition(RecordingMode.WARPED, noise_mm, replace(plain, noise_stds=(noise_mm / 1000,)))
+        options = replace(plain, noise_stds=(noise_mm / 1000,))
+        yield RecordingCondition(RecordingMode.WARPED, noise_mm, options, closed_world)
     variations: dict[RecordingMode, Json] = {
         RecordingMode.DRIVEN: {"motions": ("drive",)},
         RecordingMode.NO_WALLS: {"walled": 0.0},
@@ -230,7 +247,7 @@ def conditions(sessions: int) -> Iterator[RecordingCondition]:
     for name, change in variations.items():
         for noise_mm in OTHERS_NOISE:
             options = replace(plain, noise_stds=(noise_mm / 1000,), **change)
-            yield RecordingCondition(name, noise_mm, options)
+            yield RecordingCondition(name, noise_mm, options, closed_world)
 
 
 ShippedResult = tuple[RecordingCondition, str, int, Json]
@@ -255,6 +272,7 @@ class ShippedSuite:
         mappers: Sequence[str] = MAPPERS,
         modes: Sequence[str] = (),
         jobs: int | None = None,
+        closed_world: bool = False,
     ) -> list[ShippedResult]:
         """Evaluate what is missing.
 
@@ -263,6 +281,8 @@ class ShippedSuite:
             mappers: Names of the mappers.
             modes: Modes of recording (RecordingMode); all where none is named.
             jobs: Number of processes; None: one for each available core.
+            closed_world: Whether refinement takes all that stands there to be one of the kinds, or a wall: rows of
+                their own.
 
         Returns:
             All results so far.
@@ -275,7 +295,7 @@ class ShippedSuite:
         if not available:
             raise UsageError(f"{self.weights} holds no weights: a folder for each mapper is wanted")
         for mapper in available:
-            for condition in conditions(sessions):
+            for condition in conditions(sessions, closed_world):
                 if not modes or condition.name in modes:
                     self._evaluate(condition, sessions, mapper, jobs)
         return self.results()
@@ -287,7 +307,7 @@ class ShippedSuite:
             return
         with announce_duration(path.stem, self.announce):
             seeds = [seed for _, seed in session_seeds(condition.options)]
-            result = evaluate_sessions(seeds, condition.options, mapper, weights, jobs)
+            result = evaluate_sessions(seeds, condition.options, mapper, weights, jobs, condition.closed_world)
         path.parent.mkdir(parents=True, exist_ok=True)
         write_text(path, strict_json.dumps(result, indent=1))
 
@@ -298,7 +318,7 @@ class ShippedSuite:
             UsageError: There are none.
         """
         found = []
-        for condition in conditions(1):
+        for condition in (*conditions(1), *conditions(1, closed_world=True)):
             for mapper in MAPPERS:
                 paths = (self.work / "results").glob(f"{condition.slug}.*.{mapper}.json")
                 counts = [int(path.name.split(".")[1]) for path in paths]

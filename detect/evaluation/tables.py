@@ -307,7 +307,9 @@ The columns after «refined» evaluate the primitives of a replay, refined with 
 reported primitives (correct kind, polygon IoU of at least 0.5). mAP is the field's (COCO: precision interpolated at
 101 recalls, mean over the kinds): the boxes around the outlines of the reported primitives, each with its kind and
 score. Position (the distance of the centroids), width and height are mean errors over the true positives, the
-angle's error is the median. «–»: not measured, or no true positive.
+angle's error is the median. A primitive that is told to be an object of no kind counts as not found. Rows of a
+«closed world» (`--closed-world`) do without such objects: all that stands there is taken to be one of the kinds, or a
+wall. «–»: not measured, or no true positive.
 
 ¹ Weighted mAP is a rule of our own, not to be compared with mAP elsewhere: each primitive counts as every kind with
 that kind's posterior probability, and one that was fitted but rejected counts too, with a tenth of it."""
@@ -349,9 +351,9 @@ def write_shipped_report(results: Sequence[ShippedResult], folder: Path, force: 
     for condition, mapper, sessions, result in results:
         values = _shipped_values(result)
         cells = [_cell(value, None, 2 if name in SHIPPED_ERRORS else 3) for name, value in values.items()]
-        lines.append(f"| {condition.name} | {condition.noise_mm} | {mapper} | {sessions} | {' | '.join(cells)} |")
+        lines.append(f"| {condition.title} | {condition.noise_mm} | {mapper} | {sessions} | {' | '.join(cells)} |")
         texts = ("" if value is None else f"{value:.5g}" for value in values.values())
-        writer.writerow((condition.name, condition.noise_mm / 1000, mapper, sessions, *texts))
+        writer.writerow((condition.title, condition.noise_mm / 1000, mapper, sessions, *texts))
     markdown = "\n".join(lines) + "\n"
     return _write_report(folder, SHIPPED_REPORT, [markdown.encode(), text.getvalue().encode()], force)
 
@@ -365,13 +367,14 @@ def shipped_summary(results: Sequence[ShippedResult], mode: str, mapper: str) ->
         mapper: Name of the mapper.
 
     Returns:
-        A Markdown table with a row for each noise; F1 of the networks is that of what they report, as of refinement.
+        A Markdown table with a row for each noise, of an open world; F1 of the networks is that of what they report,
+        as of refinement.
     """
     chosen = ("map50", "map50_95", *SHIPPED_ERRORS)
     titles = ("noise", "sessions", "F1: networks", "**refined**", *(SHIPPED_COLUMNS[name] for name in chosen))
     lines = [f"| {' | '.join(titles)} |", "|---|" + "---:|" * (len(titles) - 1)]
     for condition, name, sessions, result in results:
-        if (condition.name, name) == (mode, mapper):
+        if (condition.title, name) == (mode, mapper):
             values = _shipped_values(result)
             cells = [f"{result[part]['found'][2]:.3f}" for part in ("networks", "refined")]
             cells += [_cell(values[key], None, 2 if key in SHIPPED_ERRORS else 3) for key in chosen]

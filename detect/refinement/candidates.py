@@ -26,6 +26,7 @@ from detect.refinement.options import DEFAULTS, RefinementOptions
 from detect.refinement.outlines.free_outline import ranges_of
 from detect.refinement.surroundings.map_cells import MapCells
 from detect.refinement.surroundings.walls import Wall, walls_behind
+from detect.refinement.wall_surfaces import measure_walls, sharpen
 from prim.arrays import FloatArray
 from prim.shapes import Primitive
 
@@ -164,13 +165,13 @@ def _fit_candidate(candidate: Candidate, bundle: RayBundle, search: bool, sensor
     else:
         fits = refit(candidate.fits, bundle, sensor, options.fit)
     possible = [fit for fit in fits if candidate.is_possible(primitive_of(fit.kind, fit.p))]
-    evidence = {fit.kind: laplace_evidence(fit, options=options.evidence) for fit in possible or fits}
+    rated = [(laplace_evidence(fit, options=options.evidence), fit) for fit in possible or fits]
     # the dispersion is left out here, and multiplies the limit: only the Occam factors differ from dividing by it
-    ordered = sorted(possible or fits, key=lambda fit: -evidence[fit.kind])
-    limit = evidence[ordered[0].kind] - options.evidence.log_evidence_margin * sensor.dispersion
-    likely = {kind for kind, value in evidence.items() if value > limit}
+    rated.sort(key=lambda item: -item[0])
+    limit = rated[0][0] - options.evidence.log_evidence_margin * sensor.dispersion
+    likely = {fit.kind for evidence, fit in rated if evidence > limit}
     likely |= {SPECIAL_CASES[kind] for kind in likely if kind in SPECIAL_CASES}
-    candidate.set_fits([fit for fit in ordered if fit.kind in likely], bundle, sensor)
+    candidate.set_fits([fit for _, fit in rated if fit.kind in likely], bundle, sensor)
 
 
 def _is_unchanged(
@@ -201,15 +202,17 @@ def find_backgrounds(
     Returns:
         For each candidate whether its background has changed much.
     """
-    shapes = [candidate.current for candidate in candidates]
+    shapes, guesses = [one.current for one in candidates], [one.start for one in candidates]
     occupied = cells.without(shapes, margin)
-    walls = walls_behind(cells, shapes, [candidate.start for candidate in candidates], options.walls, options.lines)
+    walls = walls_behind(cells, shapes, guesses, options.walls, options.lines)
     for wall in walls:
         occupied[wall.cells] = False
     distances = DistanceMap.of(occupied, cells.frame)
-    found = pool.map(lambda candidate: distances.background(candidate.bundle), candidates)
+    seen = list(pool.map(lambda candidate: distances.background(candidate.bundle), candidates))
+    straight = measure_walls(cells.walls, _rays_beside(candidates, seen, options), cells.frame.resolution)
     changed = []
-    for candidate, background in zip(candidates, found, strict=True):
+    for candidate, cast in zip(candidates, seen, strict=True):
+        background = sharpen(cast, candidate.bundle, straight, cells.frame.resolution, options.surfaces)
         limits = candidate.options.map
         before, candidate.background = candidate.background, background
         near = limits.occluder_distance
@@ -220,6 +223,17 @@ def find_backgrounds(
         moved = np.abs(before.ranges - background.ranges) > limits.moved_range
         changed.append(bool(np.mean(moved) > limits.moved_share))
     return changed
+
+
+def _rays_beside(
+    candidates: Sequence[Candidate], backgrounds: Sequence[Background], options: RefinementOptions
+) -> list[tuple[RayBundle, Background]]:
+    """Return the rays of each candidate that pass clear of it, with their background."""
+    pairs = []
+    for candidate, background in zip(candidates, backgrounds, strict=True):
+        clear = ~candidate.bundle.passing(candidate.current, options.surfaces.clear)
+        pairs.append((candidate.bundle.select(clear), background.select(clear)))
+    return pairs
 
 
 def centroid_distance(a: Primitive, b: Primitive) -> float:

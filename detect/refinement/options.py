@@ -118,8 +118,30 @@ class FitOptions:
     """nats; nor is another fit of one kind."""
     starts_kept: int = 2
     """Coarse fits of a kind that are continued."""
-    equilateral: float = 1.3
-    """A triangle whose sides differ by a smaller factor may have been fitted with the wrong apex."""
+    same_mode: float = 4.0
+    """Standard deviations of either within which two fits are of one mode: the evidence's samples reach as far."""
+    mode_cost_margin: float = 12.0
+    """nats; a mode that is less likely by this much than the best one of its kind is left out: somewhat above
+    EvidenceOptions.mode_margin, since modes of equal cost differ in volume."""
+    modes_kept: int = 3
+    """Modes of a kind that are kept: a triangle has three apexes. Bounds the time."""
+    max_extent: float = 0.7
+    """m; EvidenceOptions.max_extent: a fit that is larger is no shape by the prior, …"""
+    too_large_nats: float = 1.0
+    """nats; … and one that is not is preferred to it where it is less likely by no more."""
+    scattered: int = 100
+    """Shapes scattered about the best fit of a likely kind, from which it is fitted again;"""
+    scatter: float = 4.0
+    """their standard deviations, in those of the fit: other maxima lie 4 to 10 of them away (README's outliers)."""
+    scatter_blur: float = 0.004
+    """m; with which they are compared."""
+    scatter_kept: int = 2
+    """How many of them are fitted."""
+    scatter_cost_margin: float = 3.0
+    """nats; kinds whose cost is within this of the least are likely."""
+    equilateral: float = 2.0
+    """A triangle whose sides differ by a smaller factor may have been fitted with the wrong apex: noise of 0.25 to
+    0.5 m takes sides of 0.11 and 0.21 m for each other."""
     stretch: float = 1.03
     """Factor by which an ellipse's start is longer (and shorter) than the circle that it begins with."""
     first_damping: float = 1e-2
@@ -152,8 +174,15 @@ class EvidenceOptions:
     """m; the prior of sizes is uniform up to this extent: twice the recorder's largest (0.32 m), and some."""
     contender: float = 7.0
     """nats; kinds within this of the best one's Laplace approximation are sampled: e^-7 is below 0.1 %."""
+    mode_margin: float = 9.0
+    """nats; and of each of these kinds the modes within this of its best one: Laplace's approximations of one kind's
+    modes are off by some nats against each other."""
     samples: tuple[int, ...] = (300, 300, 600)
     """Samples in each round."""
+    more_samples: tuple[int, ...] = (900, 1800)
+    """Samples in each further round, of which there are as many as it takes until …"""
+    enough_effective: float = 40.0
+    """… the effective sample size of a round is this: else the posterior of a rough likelihood is too narrow."""
     degrees: float = 6.0
     """Degrees of freedom of the proposal, Student's t: heavier tails than the posterior's."""
     min_effective: float = 0.15
@@ -172,6 +201,11 @@ class EvidenceOptions:
     """Standard deviations within which a ray's hit or miss must not change to be summed up once."""
     same_sizes: float = 0.0005
     """m; sizes that differ by less make a square of a rectangle: no pose is known better."""
+    unseen_size: float = 0.15
+    """Relative standard deviation of a size from which on no ray has seen it,"""
+    unseen_margin: float = 3.0
+    """and nats within which a kind that does not know a size is reported in the place of its special case: where
+    that size is not seen at all, both evidences are the same but for the samples."""
     log_evidence_margin: float = 30.0
     """nats (times the dispersion); a kind whose evidence is less by this much is not fitted again."""
 
@@ -212,6 +246,8 @@ class MapOptions:
     """m; occupied cells around a candidate that are its own, before it is fitted."""
     cleared: float = 0.02
     """m; and afterwards."""
+    blur: float = 0.1
+    """m; noise blurs a primitive so far into the map: connected cells this near are its own."""
     occluder_distance: float = 2.5
     """m; candidates further apart do not occlude each other: few rays pass both."""
 
@@ -256,6 +292,28 @@ class WallOptions:
     """m; of the rectangle that stands for it."""
     beyond: float = 0.15
     """m; that reaches so far beyond a candidate on both sides."""
+
+
+@dataclass(frozen=True)
+class SurfaceOptions:
+    """Straight walls measured by rays."""
+
+    width: float = 3.5
+    """cells; cells this near to a wall's line are the wall's: its line is known no better by them."""
+    min_incidence: float = 0.2
+    """Cosine; rays more oblique than this do not say where a wall is."""
+    min_rays: int = 50
+    """Fewer rays measure no wall."""
+    clear: float = 0.03
+    """m; rays that pass a candidate nearer than this may have met it."""
+    iterations: int = 5
+    """Of the robust regression,"""
+    huber: float = 1.345
+    """standard deviations from which on its residuals count less (95 % efficiency; Huber 1964)."""
+    slope_precision: float = 100.0
+    """A wall's direction by its cells is not changed where few rays say so: weight of a slope of 0."""
+    uncertainty: float = 0.002
+    """m; of a measured wall: none is straight to less."""
 
 
 @dataclass(frozen=True)
@@ -524,6 +582,7 @@ class RefinementOptions:
     map: MapOptions = field(default_factory=MapOptions)
     lines: LineOptions = field(default_factory=LineOptions)
     walls: WallOptions = field(default_factory=WallOptions)
+    surfaces: SurfaceOptions = field(default_factory=SurfaceOptions)
     proposals: ProposalOptions = field(default_factory=ProposalOptions)
     acceptance: AcceptanceOptions = field(default_factory=AcceptanceOptions)
     outline: OutlineOptions = field(default_factory=OutlineOptions)

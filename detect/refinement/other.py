@@ -8,7 +8,7 @@ in the map.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -39,12 +39,15 @@ class Alternative:
         log_odds: Log Bayes factor against the likeliest kind (nats).
         std: Standard deviation (m) of the outline, across it; the median over its vertices.
         reason: What it is, in words and numbers.
+        is_told: Whether a candidate that it is likelier for than the kinds is told as it; else the kind is told, with
+            the probability that is left.
     """
 
     vertices: FloatArray
     log_odds: float
     std: float
     reason: str
+    is_told: bool = True
 
 
 def free_alternatives(
@@ -61,17 +64,16 @@ def free_alternatives(
     Returns:
         Those that differ from the likeliest kind's outline.
     """
-    evidence = {
-        fit.kind: laplace_evidence(fit, sensor.dispersion, candidate.options.evidence) for fit in candidate.fits
-    }
-    best = max(candidate.fits, key=lambda fit: evidence[fit.kind])
+    rated = [(laplace_evidence(fit, sensor.dispersion, candidate.options.evidence), fit) for fit in candidate.fits]
+    rated.sort(key=lambda item: -item[0])
+    evidence, best = rated[0]
     deformed = _deformed(candidate, best, bundle, sensor)
-    polygon = _polygon(candidate, evidence[best.kind], bundle, candidates, sensor)
+    polygon = _polygon(candidate, evidence, bundle, candidates, sensor)
     outline, other = primitive_of(best.kind, best.p).outline(), candidate.options.other
     found = _different([one for one in (deformed, polygon) if one is not None], outline, other)
     if any(one.log_odds > other.overwhelming for one in found):
         return found
-    return found + _different(_templates(candidate, evidence, bundle, sensor), outline, other)
+    return found + _different(_templates(candidate, rated, bundle, sensor), outline, other)
 
 
 def _different(found: Sequence[Alternative], outline: FloatArray, options: OtherOptions) -> list[Alternative]:
@@ -98,7 +100,8 @@ def _polygon(
     """Fit polygons; None where there is nothing to begin with."""
     options = candidate.options.polygon
     others = [other.current for other in candidates if other is not candidate]
-    starts = polygon_starts([primitive_of(fit.kind, fit.p) for fit in candidate.fits], options)
+    likeliest = {fit.kind: fit for fit in reversed(candidate.fits)}
+    starts = polygon_starts([primitive_of(fit.kind, fit.p) for fit in likeliest.values()], options)
     contour = contour_of(candidate.current, candidate.cells, others, candidate.walls, options)
     if contour is not None:
         starts.append(contour)
@@ -111,16 +114,14 @@ def _polygon(
 
 
 def _templates(
-    candidate: Candidate, evidence: Mapping[Kind, float], bundle: RayBundle, sensor: BeamModel
+    candidate: Candidate, rated: Sequence[tuple[float, KindFit]], bundle: RayBundle, sensor: BeamModel
 ) -> list[Alternative]:
-    """Fit templates in the frames of the fitted kinds."""
-    options = candidate.options
-    ranked = sorted(candidate.fits, key=lambda fit: -evidence[fit.kind])
-    primitives, likeliest = [primitive_of(fit.kind, fit.p) for fit in ranked], evidence[ranked[0].kind]
-    fits = fit_templates(primitives, likeliest, bundle, sensor, options.evidence.max_extent, options.templates)
+    """Fit templates in the frames of the fitted kinds, which come with their evidence, likeliest first."""
+    options, evidence = candidate.options, rated[0][0]
+    primitives = [primitive_of(fit.kind, fit.p) for _, fit in rated]
     found = []
-    for fit in fits:
-        log_odds = fit.log_evidence - likeliest - options.other.template_handicap
+    for fit in fit_templates(primitives, evidence, bundle, sensor, options.evidence.max_extent, options.templates):
+        log_odds = fit.log_evidence - evidence - options.other.template_handicap
         reason = f"{fit.name} explains its rays better by {log_odds:.0f} nats"
         found.append(Alternative(fit.vertices, log_odds, fit.std, reason))
     return found
@@ -152,7 +153,7 @@ def larger_alternatives(
         found.append(Alternative(outline, nats - options.contact.min_nats, 0.0, reason))
     if is_flush(primitive, candidate.cells, others, options.contact):
         reason = "one side is flush with what is beside it: as likely a part of that"
-        found.append(Alternative(outline, math.log(options.other.flush / len(Kind)), 0.0, reason))
+        found.append(Alternative(outline, math.log(options.other.flush / len(Kind)), 0.0, reason, is_told=False))
     return found
 
 

@@ -47,9 +47,6 @@ from prim.scan import Scan
 from prim.se2 import Pose2D
 from prim.shapes import Kind, Primitive
 
-MAX_LOG_ODDS = 700.0
-"""Nats beyond which odds are as good as none: the exponential is finite."""
-
 
 @dataclass(frozen=True)
 class RefinedPrimitive:
@@ -88,7 +85,7 @@ class RefinedPrimitive:
     @property
     def is_other(self) -> bool:
         """Whether it is likelier none of the kinds than one of them."""
-        return self.alternative is not None and self.other_probability > 0.5
+        return self.alternative is not None and self.alternative.is_told and self.other_probability > 0.5
 
     def beside(self, alternatives: Sequence[Alternative], options: OtherOptions) -> RefinedPrimitive:
         """Hold the kinds against alternatives.
@@ -103,7 +100,7 @@ class RefinedPrimitive:
         if not alternatives:
             return self
         likeliest = self.kind_probabilities[self.primitive.kind]
-        probability = 1 / (1 + math.exp(-max(other_log_odds(alternatives, likeliest, options), -MAX_LOG_ODDS)))
+        probability = float(np.exp(-np.logaddexp(0.0, -other_log_odds(alternatives, likeliest, options))))
         best = max(alternatives, key=lambda one: one.log_odds)
         return replace(self, other_probability=probability, alternative=best)
 
@@ -575,7 +572,7 @@ def _compare_with_map(
     if not meets.any():
         return 0.0, 0, 0.0
     met, cells = bundle.select(meets), map_alone.select(meets)
-    own = np.log(surface_likelihood(met, ranges[meets], np.ones(len(met), np.bool_), 0.0, sensor))
+    own = np.log(surface_likelihood(met, ranges[meets], np.ones(len(met), np.bool_), np.zeros(len(met)), sensor))
     free = np.log(surface_likelihood(met, cells.ranges, cells.hits_map, cells.uncertainty, sensor))
     x, y = met.rays[:2] + ranges[meets] * met.rays[2:4] - [[primitive.x], [primitive.y]]
     sector = np.floor(np.arctan2(y, x) / (2 * math.pi) * sectors).astype(int) % sectors

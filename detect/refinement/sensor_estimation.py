@@ -11,11 +11,21 @@ from numpy.typing import NDArray
 
 from detect.refinement.candidates import Candidate
 from detect.refinement.fitting.evidence import exact_costs
+from detect.refinement.fitting.fit import KindFit
 from detect.refinement.likelihood.geometry import JACOBIANS, NUMBERS, OUTLINES, ranges_to
-from detect.refinement.likelihood.kernels import MEASURED, OCCLUSION, PARAMETERS, RANGE, gradient, upper_tail
+from detect.refinement.likelihood.kernels import (
+    MEASURED,
+    OCCLUSION,
+    PARAMETERS,
+    RANGE,
+    RayData,
+    gradient,
+    upper_tail,
+)
 from detect.refinement.likelihood.rays import RayBundle
 from detect.refinement.likelihood.sensor_model import BeamModel, table_nearest
 from detect.refinement.options import DEFAULTS, SensorOptions
+from detect.refinement.outlines.kernels import outline_likelihood
 from prim import linear_algebra
 from prim.arrays import FloatArray
 from prim.normal import NORMAL_MAD
@@ -162,9 +172,8 @@ def clustered_dispersion(candidates: Sequence[Candidate], sensor: BeamModel) -> 
         1 or more.
     """
     options = sensor.options
-    fitting = _without_outlines(candidates)
-    bundles = [candidate.rays_with_background(candidates, sensor) for candidate in fitting]
-    pairs = zip(fitting, bundles, strict=True)
+    bundles = [candidate.rays_with_background(candidates, sensor) for candidate in candidates]
+    pairs = zip(candidates, bundles, strict=True)
     scores = [score for pair in pairs if (score := _scan_scores(*pair, sensor)) is not None]
     largest = 1.0
     for length in options.stretches:
@@ -189,23 +198,47 @@ def clustered_dispersion(candidates: Sequence[Candidate], sensor: BeamModel) -> 
 def _scan_scores(candidate: Candidate, bundle: RayBundle, sensor: BeamModel) -> FloatArray | None:
     """Return the whitened score (S, K) of each scan's rays by a candidate's own parameters.
 
-    Independent rays give each a mean square of 1 / S. None where the information is singular.
+    Of a free outline it is that by its place. Independent rays give each a mean square of 1 / S. None where the
+    information is singular.
     """
-    fit = candidate.fits[0]
-    jacobian, blur = JACOBIANS[fit.kind], max(sensor.footprint, sensor.options.min_score_blur)
-
-    def score_and_information(part: RayBundle) -> tuple[FloatArray, FloatArray]:
-        slope, information = np.zeros(PARAMETERS), np.zeros((PARAMETERS, PARAMETERS))
-        gradient(OUTLINES, NUMBERS[fit.kind], fit.p, sensor.data(part), blur, slope, information)
-        return jacobian.T @ slope, jacobian.T @ information @ jacobian
-
-    lower = linear_algebra.cholesky(score_and_information(bundle)[1])
+    blur = max(sensor.footprint, sensor.options.min_score_blur)
+    outline = candidate.outline
+    score_of = _score_by_parameters(candidate.fits[0]) if outline is None else _score_by_place(outline)
+    lower = linear_algebra.cholesky(score_of(sensor.data(bundle), blur)[1])
     whiten = None if lower is None else linear_algebra.inverse(lower)
     if whiten is None:
         return None
     scans, number = np.unique(bundle.scan, return_inverse=True)
     parts = (bundle.select(number == k) for k in range(len(scans)))
-    return np.array([whiten @ score_and_information(part)[0] for part in parts])
+    return np.array([whiten @ score_of(sensor.data(part), blur)[0] for part in parts])
+
+
+Score = Callable[[RayData, float], tuple[FloatArray, FloatArray]]
+"""A function of rays and a blur (m): score (K,) and information (K, K)."""
+
+
+def _score_by_parameters(fit: KindFit) -> Score:
+    """Return the score of rays by a kind's own parameters."""
+    jacobian = JACOBIANS[fit.kind]
+
+    def score(data: RayData, blur: float) -> tuple[FloatArray, FloatArray]:
+        slope, information = np.zeros(PARAMETERS), np.zeros((PARAMETERS, PARAMETERS))
+        gradient(OUTLINES, NUMBERS[fit.kind], fit.p, data, blur, slope, information)
+        return jacobian.T @ slope, jacobian.T @ information @ jacobian
+
+    return score
+
+
+def _score_by_place(outline: FloatArray) -> Score:
+    """Return the score of rays by the place of an outline (V, 2): the sum of those by its vertices."""
+
+    def score(data: RayData, blur: float) -> tuple[FloatArray, FloatArray]:
+        slope, information = np.zeros(outline.size), np.zeros((outline.size, outline.size))
+        outline_likelihood(outline, data, blur, slope, information)
+        count = len(outline)
+        return slope.reshape(count, 2).sum(axis=0), information.reshape(count, 2, count, 2).sum(axis=(0, 2))
+
+    return score
 
 
 def _without_truncation(error: FloatArray, cut: FloatArray) -> FloatArray:

@@ -21,7 +21,7 @@ from prim.log.decoding.ros import SCAN_GEOMETRY, SCAN_HEAD
 from prim.scan import Scan
 from prim.se2 import Pose2D
 from prim.shapes import Primitive
-from prim.world import World
+from prim.world import Solid, World
 
 SCAN_TOPIC = "/scan"
 ODOM_TOPIC = "/odom"
@@ -166,6 +166,9 @@ def encode_transforms(transforms: Iterable[tuple[int, str, str, Pose2D]]) -> byt
 def encode_primitives(stamp: int, world: World) -> bytes:
     """Encode a world as visualization_msgs/MarkerArray: outlines to draw, kind and size as JSON in ``text``.
 
+    Primitives are of the namespace «primitives», one marker each. Walls, clutter and structure have one marker each
+    for all of them, in namespaces of their own.
+
     Args:
         stamp: Ns.
         world: The world.
@@ -176,6 +179,9 @@ def encode_primitives(stamp: int, world: World) -> bytes:
     markers = [_primitive_marker(stamp, i, primitive) for i, primitive in enumerate(world.primitives)]
     if world.walls:
         markers.append(_walls_marker(stamp, world))
+    for namespace, solids in (("clutter", world.clutter), ("structure", world.structure)):
+        if solids:
+            markers.append(_solids_marker(stamp, namespace, solids))
     return _serialize(_new(MARKERS_TYPE, markers=markers))
 
 
@@ -229,6 +235,7 @@ _LINE_WIDTH = 0.01
 _OUTLINE_POINTS = 64
 """Vertices that are drawn of a curved outline."""
 _GREY = (128, 128, 128)
+_LIGHT_GREY = (190, 190, 190)
 _MAX_CHANNEL = 255
 
 
@@ -244,6 +251,12 @@ def _walls_marker(stamp: int, world: World) -> Any:
     ends = np.asarray(world.walls).reshape(-1, 2)
     text = strict_json.dumps({"walls": world.to_json()["walls"]})
     return _marker(stamp, "walls", 0, _LINE_LIST, Pose2D(), list(ends), text, _GREY)
+
+
+def _solids_marker(stamp: int, namespace: str, solids: Sequence[Solid]) -> Any:
+    ends = np.vstack([solid.as_segments() for solid in solids]).reshape(-1, 2)
+    text = strict_json.dumps({namespace: [solid.to_json() for solid in solids]})
+    return _marker(stamp, namespace, 0, _LINE_LIST, Pose2D(), list(ends), text, _LIGHT_GREY)
 
 
 def _marker(

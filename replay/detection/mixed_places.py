@@ -14,7 +14,7 @@ import numpy as np
 
 from detect.detection import Detection
 from detect.refinement.options import DEFAULTS as REFINEMENT
-from detect.refinement.options import StandingOptions
+from detect.refinement.options import RefinementOptions, StandingOptions
 from detect.refinement.standing import Verdict, judge_places
 from detect.refinement.surroundings.map_cells import MapCells
 from prim.arrays import FloatArray
@@ -50,6 +50,7 @@ def add_disagreement(
     cells: MapCells,
     noise_std: float,
     slack: float = 0.0,
+    refinement: RefinementOptions = REFINEMENT,
     options: MixedOptions = DEFAULTS,
 ) -> Detection:
     """Add to a fit's covariance how far its later scans disagree with it: the last half, the last quarter and so on.
@@ -60,7 +61,8 @@ def add_disagreement(
         cells: Those of the map that shows what is behind the primitive.
         noise_std: Range noise (m).
         slack: What the poses' errors alone may displace it by (m).
-        options: Numeric parameters.
+        refinement: Numeric parameters of the fits.
+        options: Those of the judgement.
 
     Returns:
         The detection with the larger covariance; the same one where they agree.
@@ -70,7 +72,7 @@ def add_disagreement(
     part = [piece for piece in scans if detection.since is None or piece[0].stamp >= detection.since]
     reach = options.max_displacement * detection.primitive.bounding_radius
     limits = StandingOptions(min_gain=options.min_gain, min_displacement=options.min_displacement)
-    refinement = replace(REFINEMENT, standing=limits)
+    refinement = replace(refinement, standing=limits)
     displacements = []
     while len(part) // 2 >= options.min_scans:
         part = part[len(part) // 2 :]

@@ -4,8 +4,9 @@ The map of all scans, and fits to all rays, mix the places of a primitive that w
 scans judge what was refined by all of them (:func:`detect.refinement.standing.judge_places`). Where they contradict
 some of it, primitives are detected in a map of the recent scans, too, and refined by these. The first ones count only
 if the older scans contradict them in turn: they were not there before. From then on these are refined by the scans
-since, as long as later scans agree. The error bars of all are widened where the later ones of the scans that they are
-fitted to disagree (:func:`replay.detection.mixed_places.add_disagreement`). Where nothing moves, nothing changes.
+since, as long as later scans agree. Objects of no kind stay, but for those where something that moved stands now. The
+error bars of all are widened where the later ones of the scans that they are fitted to disagree
+(:func:`replay.detection.mixed_places.add_disagreement`). Where nothing moves, nothing changes.
 """
 
 from __future__ import annotations
@@ -16,12 +17,14 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from detect.detection import Detection, Detections, Rejection
+from detect.detection import Detection, Detections, Rejection, UnknownObject
+from detect.refinement.options import DEFAULTS as REFINEMENT
+from detect.refinement.options import RefinementOptions
 from detect.refinement.refine import Effort, WarmStart, refine_detections
 from detect.refinement.standing import Judgement, Verdict, judge_places
 from detect.refinement.surroundings.map_cells import MapCells
 from mapping.grid import UNKNOWN, OccupancyGrid
-from prim.metrics import overlap_coefficient
+from prim.metrics import outline_overlap, overlap_coefficient
 from prim.scan import Scan
 from prim.se2 import Pose2D
 from prim.threads import cores
@@ -39,11 +42,13 @@ class MovedOptions:
         pose_deviations: The errors of poses are within so many standard deviations …
         pose_distance: … those of headings as they matter at this distance from the laser (m).
         max_shared: Of two detections that share more of the smaller one's area, one is wrong.
+        looks: For so many looks the recent scans are searched for what was found, and by all scans is no more.
     """
 
     pose_deviations: float = 4.0
     pose_distance: float = 2.0
     max_shared: float = 0.25
+    looks: int = 3
 
 
 DEFAULTS = MovedOptions()
@@ -82,7 +87,8 @@ class MovedPrimitives:
         make_map: Makes a map of some scans, in the frame of the detector's map.
         detect: Detects primitives in a map.
         pose_std: Standard deviations of the poses' positions (m) and headings (rad).
-        options: Numeric parameters.
+        refinement: Numeric parameters of the fits.
+        options: Those of what moves.
     """
 
     def __init__(
@@ -90,14 +96,17 @@ class MovedPrimitives:
         make_map: Callable[[Pieces], OccupancyGrid],
         detect: Callable[[OccupancyGrid], Detections],
         pose_std: tuple[float, float],
+        refinement: RefinementOptions = REFINEMENT,
         options: MovedOptions = DEFAULTS,
     ) -> None:
         self._make_map = make_map
         self._detect = detect
         position, heading = pose_std
         self._slack = options.pose_deviations * math.hypot(position, heading * options.pose_distance)
+        self._refinement = refinement
         self._options = options
         self._moved: tuple[Detection, ...] = ()
+        self._lost: list[tuple[Detection, int]] = []  # and for how many looks
 
     def correct(self, look: Look, scans: Callable[[], Iterable[tuple[Scan, Pose2D]]], effort: Effort) -> Detections:
         """Replace what recent scans contradict by what they show.
@@ -114,7 +123,7 @@ class MovedPrimitives:
         judged = self._judge(found, look.recent, look.cells, look.noise_std)
         stands = [d for d, judgement in zip(found, judged, strict=True) if judgement.verdict is Verdict.STANDS]
         self._moved = tuple(moved for moved in self._moved if not self._stood_always(moved, stands, look))
-        if len(stands) == len(found) and not self._moved:
+        if not (self._has_lost(found) or self._moved) and len(stands) == len(found):
             return look.detections
         pieces = list(scans())
         self._moved = self._refine_moved(look, judged, stands, pieces, effort)
@@ -125,13 +134,30 @@ class MovedPrimitives:
         kept = [d for d, keep in zip(found, keeps, strict=True) if keep]
         dropped = [_rejection(d) for d, keep in zip(found, keeps, strict=True) if not keep]
         honest = [
-            add_disagreement(detection, pieces, look.cells, look.noise_std, self._slack)
+            add_disagreement(detection, pieces, look.cells, look.noise_std, self._slack, self._refinement)
             for detection in (*kept, *self._moved)
         ]
         answer = sorted(honest, key=lambda detection: -detection.score)
         return replace(
-            look.detections, found=tuple(answer), rejected=tuple(_by_score([*look.detections.rejected, *dropped]))
+            look.detections,
+            found=tuple(answer),
+            rejected=tuple(_by_score([*look.detections.rejected, *dropped])),
+            objects=tuple(thing for thing in look.detections.objects if not self._is_replaced(thing)),
         )
+
+    def _has_lost(self, found: Sequence[Detection]) -> bool:
+        """Return whether something was found at one of the last looks, and by the rays of all scans is no more.
+
+        A primitive that was pushed is none of the kinds to scans that show it in two places.
+        """
+        lost = [(known, looks + 1) for known, looks in self._lost if not self._shares(known, found)]
+        self._lost = [(known, 0) for known in found] + [pair for pair in lost if pair[1] <= self._options.looks]
+        return len(self._lost) > len(found)
+
+    def _is_replaced(self, thing: UnknownObject) -> bool:
+        """Return whether an object of no kind, by the rays of all scans, shares too much with what moved."""
+        limit = self._options.max_shared
+        return any(outline_overlap(thing.outline, moved.primitive.outline()) > limit for moved in self._moved)
 
     def _stood_always(self, moved: Detection, stands: Sequence[Detection], look: Look) -> bool:
         """Return whether what was refined by all scans in the place of something that moved stood there all along."""
@@ -192,13 +218,14 @@ class MovedPrimitives:
         """Refine detections, each by the scans since its own stamp; return those that the rays support."""
         first = min([look.since, *(d.since for d in wanted if d.since is not None)])
         later = [piece for piece in scans if piece[0].stamp >= first]
-        refined, _ = refine_detections(Detections(tuple(wanted), ()), later, grid, look.noise_std, cores(), effort)
+        candidates = Detections(tuple(wanted), ())
+        refined, _ = refine_detections(candidates, later, grid, look.noise_std, cores(), effort, self._refinement)
         return list(refined.found)
 
     def _judge(
         self, detections: Sequence[Detection], scans: Pieces, cells: MapCells, noise_std: float
     ) -> list[Judgement]:
-        return judge_places(detections, scans, cells, noise_std, cores(), self._slack)
+        return judge_places(detections, scans, cells, noise_std, cores(), self._slack, self._refinement)
 
     def _without_overlaps(self, detections: Sequence[Detection], others: Sequence[Detection]) -> list[Detection]:
         """Return those that overlap none of some others, and none before them."""

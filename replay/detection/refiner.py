@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections import deque
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
@@ -9,6 +10,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from detect.refinement.options import DEFAULTS, RefinementOptions
 from mapping.grid import OccupancyGrid
 from prim.arrays import FloatArray
 from prim.scan import Scan
@@ -16,7 +18,7 @@ from prim.se2 import Pose2D, frame_covariances
 from prim.threads import cores
 
 if TYPE_CHECKING:
-    from detect.detection import Detection, Detections
+    from detect.detection import Detection, Detections, UnknownObject
     from detect.refinement.refine import Effort
     from detect.refinement.surroundings.map_cells import MapCells
     from replay.detection.moved_primitives import MovedPrimitives
@@ -133,6 +135,7 @@ class DetectionRefiner:
         frame_covariance: The covariance (3, 3; m, rad) of the map frame's own pose, which adds to that of each
             primitive; None where it is exact.
         moved: Refines what moves by the scans since it did; None: all is taken to stand.
+        refinement: Numeric parameters of the fits.
         options: How much work goes into detection before the last scan.
     """
 
@@ -141,11 +144,13 @@ class DetectionRefiner:
         noise_std: float | None,
         frame_covariance: FloatArray | None,
         moved: MovedPrimitives | None = None,
+        refinement: RefinementOptions = DEFAULTS,
         options: IntermediateOptions = INTERMEDIATE,
     ) -> None:
         self._scans = ScanSubset(options.scans)
         self._recent = RecentScans(options.recent_scans)
         self._moved = moved
+        self._refinement = refinement
         self._options = options
         self._noise_std = noise_std
         self._frame_covariance = frame_covariance
@@ -247,7 +252,9 @@ class DetectionRefiner:
         # imported when it is needed: a replay without refinement starts faster
         from detect.refinement.refine import refine_detections
 
-        return refine_detections(detections, scans, grid, self._noise_std, cores(), effort, cells=cells)
+        return refine_detections(
+            detections, scans, grid, self._noise_std, cores(), effort, self._refinement, cells=cells
+        )
 
     def _with_frame_uncertainty(self, detections: Detections) -> Detections:
         """Add the uncertainty of the map frame's pose to that of the detections."""
@@ -257,7 +264,8 @@ class DetectionRefiner:
             add_frame_uncertainty(detection, self._frame_covariance) if detection.std else detection
             for detection in detections.found
         )
-        return replace(detections, found=found)
+        objects = tuple(_in_uncertain_frame(thing, self._frame_covariance) for thing in detections.objects)
+        return replace(detections, found=found, objects=objects)
 
 
 def add_frame_uncertainty(detection: Detection, frame_covariance: FloatArray) -> Detection:
@@ -280,3 +288,11 @@ def add_frame_uncertainty(detection: Detection, frame_covariance: FloatArray) ->
     covariance[np.ix_(pose, pose)] += added[np.ix_(pose, pose)]
     std = dict(zip(primitive.kind.parameters, np.sqrt(np.diag(covariance)).tolist(), strict=True))
     return replace(detection, std=std, covariance=covariance)
+
+
+def _in_uncertain_frame(thing: UnknownObject, frame_covariance: FloatArray) -> UnknownObject:
+    """Add the uncertainty (3, 3; m, rad) of the map frame's own pose to that of an outline, across it."""
+    places = np.column_stack([thing.outline, np.zeros(len(thing.outline))])
+    added = frame_covariances(frame_covariance, places)[:, :2, :2]
+    variance = float(added.trace(axis1=1, axis2=2).mean()) / 2  # of one direction, whichever the outline's is
+    return replace(thing, std=math.hypot(thing.std, math.sqrt(variance)))

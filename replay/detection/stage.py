@@ -51,14 +51,15 @@ class TrackIdentity:
 
 @dataclass(frozen=True)
 class DetectionResult:
-    """The primitives detected in one map.
+    """The primitives detected in one map, and the objects that are none.
 
     Attributes:
-        detections: The detections and the candidates that were rejected.
+        detections: The detections, the candidates that were rejected, and the objects that are none of the kinds.
         identities: The track of each detection; without a tracker, its number.
         noise_std: The range noise that refinement estimated or was given (m); None without refinement.
         truth: The true primitives; empty without ground truth.
-        errors: How the detections compare with the truth; None without ground truth.
+        errors: How the detections compare with the truth, objects aside; None without ground truth.
+        object_ids: The number of each object: they follow the largest that a primitive was ever given.
     """
 
     detections: Detections
@@ -66,6 +67,7 @@ class DetectionResult:
     noise_std: float | None = None
     truth: tuple[Primitive, ...] = ()
     errors: DetectionErrors | None = None
+    object_ids: tuple[int, ...] = ()
 
 
 class DetectionStage:
@@ -115,7 +117,7 @@ class DetectionStage:
         poses, moved = self._posed_scans.poses, None
         if self.streaming and poses.max_std is not None:
             moved = _moved_primitives(self._detector, options, frame, poses.max_std)
-        return DetectionRefiner(options.noise_std, poses.frame_covariance, moved)
+        return DetectionRefiner(options.noise_std, poses.frame_covariance, moved, options.refinement)
 
     @property
     def streaming(self) -> bool:
@@ -179,11 +181,12 @@ class DetectionStage:
         """Identify the detections' tracks, and evaluate them against the truth at ``stamp`` (ns)."""
         with self._timer.stage("detect"):
             identities = self._identities(detections, stamp)
+            objects = self._object_ids(detections)
             if self._truth is None:
-                return DetectionResult(detections, identities, noise_std)
+                return DetectionResult(detections, identities, noise_std, object_ids=objects)
             truth = tuple(self._truth.at(stamp).primitives)
             errors = detection_errors([detection.primitive for detection in detections.found], truth)
-            return DetectionResult(detections, identities, noise_std, truth, errors)
+            return DetectionResult(detections, identities, noise_std, truth, errors, objects)
 
     def _identities(self, detections: Detections, stamp: int) -> tuple[TrackIdentity, ...]:
         """Return the track of each detection; without a tracker, number them in their order."""
@@ -194,6 +197,13 @@ class DetectionStage:
         self._has_tracks = True
         tracks = self._tracker.result().update(detections.found, stamp)
         return tuple(TrackIdentity(track.id, track.confirmed, track.std) for track in tracks)
+
+    def _object_ids(self, detections: Detections) -> tuple[int, ...]:
+        """Number the objects that are none of the kinds; primitives are identified before."""
+        last = len(detections.found)
+        if self._tracker is not None:
+            last = self._tracker.result().last_id if self._has_tracks else 0
+        return tuple(range(last + 1, last + 1 + len(detections.objects)))
 
 
 class NoDetection:
@@ -285,7 +295,7 @@ def _moved_primitives(
             mapper.accumulate(scan, pose)
         return mapper.finish()
 
-    return MovedPrimitives(make_map, detector.detect, pose_std)
+    return MovedPrimitives(make_map, detector.detect, pose_std, refinement=options.refinement)
 
 
 def _pieces(posed_scans: PosedScans) -> Iterator[tuple[Scan, Pose2D]]:

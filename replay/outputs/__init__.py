@@ -8,6 +8,7 @@ __all__, __getattr__, __dir__ = lazy_exports(
         "write_map": "replay.outputs.exports",
         "write_report": "replay.outputs.exports",
         "write_trajectory": "replay.outputs.exports",
+        "FoundObject": "replay.outputs.found_objects",
         "FoundPrimitive": "replay.outputs.found_primitives",
         "Picture": "replay.outputs.picture",
         "report_json": "replay.outputs.report",

@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
+from detect.detection import OTHER
 from prim.shapes import Kind, Primitive
 from replay.detection.stage import DetectionResult
 
@@ -27,7 +28,8 @@ class FoundPrimitive:
         score: 0 to 1: after refinement the posterior probability of its kind, else the network's score.
         stage: «refined»: fitted to the rays; «detected»: estimated by the networks alone.
         std: Standard deviations by name (m, rad): x, y, theta and the sizes; None where it was not refined.
-        chances: The posterior probability of each kind by its name; None where it was not refined.
+        chances: The posterior probability of each kind by its name, and as ``other`` that of none of them; None where
+            it was not refined.
     """
 
     id: int
@@ -63,7 +65,7 @@ class FoundPrimitive:
             score=detection.score,
             stage="detected" if detection.std is None else "refined",
             std=detection.std,
-            chances=None if chances is None else {str(kind): chance for kind, chance in chances.items()},
+            chances=None if chances is None else _by_name(chances) | {OTHER: detection.other_probability},
         )
 
     @property
@@ -76,6 +78,10 @@ class FoundPrimitive:
         std, chances = (None if values is None else dict(values) for values in (self.std, self.chances))
         found = {"score": self.score, "stage": self.stage, "std": std, "chances": chances}
         return {"id": self.id} | self.primitive.to_json() | found
+
+
+def _by_name(chances: Mapping[Kind, float]) -> dict[str, float]:
+    return {str(kind): chance for kind, chance in chances.items()}
 
 
 def found_primitives(result: DetectionResult | None) -> tuple[FoundPrimitive, ...]:

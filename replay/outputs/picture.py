@@ -13,12 +13,14 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from detect.detection import OTHER
 from mapping.grid import GridFrame, OccupancyGrid
 from prim.arrays import FloatArray
 from prim.errors import UsageError
 from prim.files import ResultFormat, write_file
 from prim.parameters import checked_path, errors_name_parameters
-from prim.shapes import Primitive
+from prim.shapes import Color, Primitive
+from replay.outputs.found_objects import OBJECT_COLOR, FoundObject
 from replay.outputs.found_primitives import FoundPrimitive
 
 _SOFTWARE = b"tEXtSoftware\0prim"
@@ -31,7 +33,7 @@ PICTURE = ResultFormat("a picture of prim", re.compile(rb"\x89PNG.{33}" + _SOFTW
 LONGER_SIDE = 1000
 """About how many pixels the longer side of a picture has; set by hand."""
 
-GREY = (130, 130, 130)
+GREY, LABEL_GREY = (130, 130, 130), (90, 90, 90)
 FONT = cv2.FONT_HERSHEY_SIMPLEX
 FONT_SCALE, TEXT_THICKNESS, OUTLINE_THICKNESS = 0.5, 1, 2
 SUBPIXEL_BITS = 4
@@ -82,14 +84,18 @@ class Picture:
 
 
 def draw_picture(
-    grid: OccupancyGrid, primitives: Sequence[FoundPrimitive] = (), truth: Sequence[Primitive] = ()
+    grid: OccupancyGrid,
+    primitives: Sequence[FoundPrimitive] = (),
+    truth: Sequence[Primitive] = (),
+    objects: Sequence[FoundObject] = (),
 ) -> Picture:
-    """Draw a map in greys (occupied black, free white, unknown grey), primitives over it, and a scale.
+    """Draw a map in greys (occupied black, free white, unknown grey), primitives and objects over it, and a scale.
 
     Args:
         grid: The map.
         primitives: Drawn in the colours of their kinds, with id and kind.
         truth: Drawn in grey.
+        objects: Those of no kind, drawn in a lighter grey, with id.
 
     Returns:
         The picture; the largest y is at the top.
@@ -103,10 +109,14 @@ def draw_picture(
     pixels = cv2.cvtColor(cv2.resize(greys, size, interpolation=interpolation), cv2.COLOR_GRAY2RGB)
     for primitive in truth:
         _draw_outline(pixels, grid.frame, primitive.outline(), GREY)
+    for thing in objects:
+        _draw_outline(pixels, grid.frame, thing.outline, OBJECT_COLOR)
     for found in primitives:
         _draw_outline(pixels, grid.frame, found.primitive.outline(), found.kind.row.color)
+    for thing in objects:
+        _draw_label(pixels, grid.frame, thing.outline, LABEL_GREY, f"{thing.id}: {OTHER}")
     for found in primitives:
-        _draw_label(pixels, grid.frame, found)
+        _draw_label(pixels, grid.frame, found.primitive.outline(), found.kind.row.color, f"{found.id}: {found.kind}")
     _draw_scale_bar(pixels, grid.frame)
     return Picture(np.asarray(pixels, np.uint8))
 
@@ -118,21 +128,18 @@ def _to_pixels(points: FloatArray, frame: GridFrame, shape: tuple[int, ...]) -> 
     return np.asarray((np.asarray(points) - (x0, y1)) * scale * (1, -1))
 
 
-def _draw_outline(
-    pixels: cv2.typing.MatLike, frame: GridFrame, outline: FloatArray, color: tuple[int, int, int]
-) -> None:
+def _draw_outline(pixels: cv2.typing.MatLike, frame: GridFrame, outline: FloatArray, color: Color) -> None:
     vertices = np.rint(_to_pixels(outline, frame, pixels.shape) * (1 << SUBPIXEL_BITS)).astype(np.int32)
     cv2.polylines(pixels, [vertices], True, color, OUTLINE_THICKNESS, cv2.LINE_AA, SUBPIXEL_BITS)
 
 
-def _draw_label(pixels: cv2.typing.MatLike, frame: GridFrame, found: FoundPrimitive) -> None:
-    """Write id and kind above a primitive, white on its colour, within the picture."""
-    text = f"{found.id}: {found.kind}"
+def _draw_label(pixels: cv2.typing.MatLike, frame: GridFrame, outline: FloatArray, color: Color, text: str) -> None:
+    """Write a text above an outline (m), white on its colour, within the picture."""
     (width, height), base = cv2.getTextSize(text, FONT, FONT_SCALE, TEXT_THICKNESS)
-    outline = _to_pixels(found.primitive.outline(), frame, pixels.shape)
-    x = int(np.clip(outline[:, 0].mean() - width / 2, 2, max(2, pixels.shape[1] - width - 2)))
-    y = int(np.clip(outline[:, 1].min() - base - 2, height + 3, pixels.shape[0] - base))
-    cv2.rectangle(pixels, (x - 2, y - height - 3), (x + width + 2, y + base), found.kind.row.color, cv2.FILLED)
+    drawn = _to_pixels(outline, frame, pixels.shape)
+    x = int(np.clip(drawn[:, 0].mean() - width / 2, 2, max(2, pixels.shape[1] - width - 2)))
+    y = int(np.clip(drawn[:, 1].min() - base - 2, height + 3, pixels.shape[0] - base))
+    cv2.rectangle(pixels, (x - 2, y - height - 3), (x + width + 2, y + base), color, cv2.FILLED)
     cv2.putText(pixels, text, (x, y), FONT, FONT_SCALE, (255, 255, 255), TEXT_THICKNESS, cv2.LINE_AA)
 
 

@@ -16,6 +16,7 @@ from prim.shapes import Kind
 from prim.text import printable
 from replay.detection.stage import DetectionResult
 from replay.notes import pluralize
+from replay.outputs.found_objects import found_objects
 from replay.outputs.found_primitives import found_primitives
 from replay.poses.fusion_options import COMPASS, GPS, ODOM
 from replay.poses.laser_poses import FusedSensor, LaserPoses
@@ -35,14 +36,15 @@ COMPARED = (
     ("map F1", "%"),
     ("AUC", ""),
     ("found", ""),
+    ("objects", ""),
     ("F1", "%"),
     ("position", "mm"),
     ("size", "mm"),
     ("angle", "deg"),
     ("mapping", "s"),
 )
-"""What is compared of several mappers, and its unit: range noise; F1 of occupied cells and AUC of the map; number, F1
-and mean errors of the primitives; the time of mapping."""
+"""What is compared of several mappers, and its unit: range noise; F1 of occupied cells and AUC of the map; numbers of
+primitives and of objects of no kind; F1 and mean errors of the primitives; the time of mapping."""
 
 MIN_NOISE_CELLS = 1.5
 """The mapper's range noise, which the table calls «range noise», cannot be distinguished from the size of the cells
@@ -87,6 +89,7 @@ def _report(result: ReplayResult) -> dict[str, Any]:
             "scores": result.scores.to_json() if result.scores else None,
         },
         "primitives": [primitive.to_json() for primitive in found_primitives(result.detections)],
+        "objects": [thing.to_json() for thing in found_objects(result.detections)],
         "refine": {"noise_std_m": result.detections.noise_std if result.detections else None},
         "errors": _errors(result.detections),
         "timing": {f"{name}_s": value for name, value in seconds.items()}
@@ -217,6 +220,7 @@ def _comparison_row(result: ReplayResult) -> list[str]:
         _scaled(scores.occupied_f1 if scores else None, 100),
         _scaled(scores.auc if scores else None, 1, 4),
         str(len(detections.detections.found)) if detections else "",
+        str(len(detections.object_ids) or "") if detections else "",
         _scaled(errors.f1 if errors else None, 100),
         _scaled(errors.position if errors else None, 1000, 2),
         _scaled(size, 1000, 2),
@@ -275,6 +279,8 @@ def _detection_rows(result: ReplayResult) -> Iterator[tuple[str, str]]:
     """
     if result.detections is not None:
         yield "primitives", _kind_counts(result.detections)
+        if result.detections.object_ids:
+            yield "objects", f"{len(result.detections.object_ids)} of no kind"
         noise_std = result.detections.noise_std
         if noise_std is not None and result.options.noise_std is None:
             bound = "at most " if noise_std <= MIN_REFINED_NOISE else ""

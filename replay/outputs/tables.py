@@ -6,6 +6,7 @@ from collections.abc import Sequence
 
 import pyarrow as pa
 
+from detect.detection import OTHER
 from prim.shapes import Kind
 from replay.outputs.found_primitives import FoundPrimitive
 
@@ -23,15 +24,15 @@ def primitives_table(primitives: Sequence[FoundPrimitive]) -> pa.Table:
 
     Returns:
         A row for each: ``id``, ``kind``, ``x``, ``y`` (m), ``theta`` (rad), all sizes by name (m), ``score``,
-        ``stage``, standard deviations as ``std_x`` and so on (m, rad), and chances of the kinds as ``chance_circle``
-        and so on; null where a primitive has none.
+        ``stage``, standard deviations as ``std_x`` and so on (m, rad), chances of the kinds as ``chance_circle`` and
+        so on, and of none of them as ``chance_other``; null where a primitive has none.
     """
     numbers = {
         **{name: [getattr(found, name) for found in primitives] for name in POSE},
         **{name: [found.size.get(name) for found in primitives] for name in SIZES},
         "score": [found.score for found in primitives],
         **{f"std_{name}": [(found.std or {}).get(name) for found in primitives] for name in (*POSE, *SIZES)},
-        **{f"chance_{kind}": [(found.chances or {}).get(kind) for found in primitives] for kind in Kind},
+        **{f"chance_{kind}": [(found.chances or {}).get(kind) for found in primitives] for kind in (*Kind, OTHER)},
     }
     columns = {
         "id": pa.array([found.id for found in primitives], pa.int64()),

@@ -8,7 +8,7 @@ from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from mapping.grid import OccupancyGrid
 from prim import linear_algebra
@@ -41,9 +41,13 @@ UNKNOWN_VALUE = 255
 
 def ring(primitive: Primitive) -> FloatArray:
     """Return a primitive's outline (RING_POINTS + 1, 2) in m, closed by its first point."""
-    outline = primitive.outline(RING_POINTS)
-    closed: FloatArray = np.vstack((outline, outline[:1]))
-    return closed
+    return closed(primitive.outline(RING_POINTS))
+
+
+def closed(outline: ArrayLike) -> FloatArray:
+    """Return an outline's vertices (N, 2) and its first one again (N + 1, 2)."""
+    vertices = np.asarray(outline, dtype=float)
+    return np.asarray(np.vstack((vertices, vertices[:1])))
 
 
 def uncertainty_bounds(primitive: Primitive, std: Mapping[str, float]) -> Iterator[Primitive]:

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 
+from detect.detection import OTHER
 from prim.text import printable
 from replay.detection.stage import DetectionResult
+from replay.outputs.found_objects import found_objects
 from replay.outputs.report import comparison_table, shared_rows, summary_rows
 from replay.result import ReplayResult
 
@@ -25,7 +27,7 @@ def summary_markdown(results: Sequence[ReplayResult]) -> str:
 
 
 def detections_markdown(result: DetectionResult) -> str:
-    """Return a table of the detected primitives: lengths in millimetres, angles in degrees."""
+    """Return a table of the detected primitives, and of the objects of no kind: millimetres and degrees."""
     lines = ["| id | kind | score | x, mm | y, mm | angle | size, mm | ± 1σ: mm, ° |", "|" + "---|" * 8]
     for identity, detection in zip(result.identities, result.detections.found, strict=True):
         primitive = detection.primitive
@@ -40,7 +42,28 @@ def detections_markdown(result: DetectionResult) -> str:
             _standard_deviations(detection.std or identity.std),
         )
         lines.append(f"| {' | '.join(cells)} |")
-    return "\n".join(lines) + "\n"
+    return "\n".join([*lines, *_object_lines(result)]) + "\n"
+
+
+def _object_lines(result: DetectionResult) -> Iterator[str]:
+    """Yield the lines of a table of the objects of no kind, after an empty one; none where there are none."""
+    objects = found_objects(result)
+    if objects:
+        yield ""
+        yield "| id | kind | score | x, mm | y, mm | extent, mm | ± 1σ, mm | reason |"
+        yield "|" + "---|" * 8
+    for thing in objects:
+        cells = (
+            str(thing.id),
+            OTHER,
+            f"{thing.score:.2f}",
+            f"{1000 * thing.x:.1f}",
+            f"{1000 * thing.y:.1f}",
+            " x ".join(f"{1000 * length:.0f}" for length in thing.extent),
+            f"{1000 * thing.std:.2f}",
+            printable(thing.reason),
+        )
+        yield f"| {' | '.join(cells)} |"
 
 
 def _standard_deviations(std: Mapping[str, float] | None) -> str:

@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from bench.same import TOLERANCE, compare, differences
+from bench.same import TOLERANCE, added_keys, compare, differences
 
 
 @pytest.mark.parametrize(
@@ -29,6 +29,16 @@ def test_each_difference_is_found(before: Any, after: Any, size: float) -> None:
     assert found == pytest.approx(size)
     runs = [{"logs": {}, "reports": {"a": value}} for value in (before, after)]
     assert compare(*runs) == (size <= TOLERANCE)
+
+
+def test_keys_may_be_added(capsys: pytest.CaptureFixture[str]) -> None:
+    before = {"primitives": [{"x": 1.0}, {"x": 2.0}]}
+    after = {"primitives": [{"x": 1.0, "other": 0.0}, {"x": 2.0, "other": 0.5}], "objects": []}
+    assert not list(differences(before, after)) and list(differences(after, before))
+    assert set(added_keys(before, after)) == {".primitives[].other", ".objects"}
+    runs = [{"logs": {}, "reports": {"a": value}} for value in (before, after)]
+    assert compare(*runs) and not compare(*runs[::-1])
+    assert "1 equal to the last bit" in capsys.readouterr().out
 
 
 def test_equal_reports_have_no_differences() -> None:

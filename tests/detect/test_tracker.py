@@ -195,7 +195,8 @@ def test_confirmation_and_deletion() -> None:
     assert tracker.update(detections(SHAPES[0]), 0)[0].id == 2
     for _ in range(DEFAULTS.delete_after):
         tracker.update([], 0)
-    assert tracker.tracks == [] and tracker.update(detections(SHAPES[0]), 0)[0].id == 3
+    assert tracker.tracks == [] and tracker.last_id == 2
+    assert tracker.update(detections(SHAPES[0]), 0)[0].id == tracker.last_id == 3
 
 
 def test_close_primitives_keep_their_ids() -> None:

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from mapping.map_metrics import map_scores
-from prim.metrics import detection_errors, match_primitives, polygon_iou, pose_rmse
+from prim.metrics import detection_errors, match_primitives, outline_overlap, polygon_iou, pose_rmse
 from prim.shapes import Kind, Primitive
 
 
@@ -44,6 +44,17 @@ def test_triangles_that_differ_by_rounding_overlap_in_full() -> None:
         for base in (0.20226531937725828, 0.2022653193772583)
     )
     assert polygon_iou(one, other) > 0.9999
+
+
+def test_outlines_overlap_by_what_they_enclose() -> None:
+    corner = np.array([[0.0, 0.0], [3.0, 0.0], [3.0, 1.0], [1.0, 1.0], [1.0, 3.0], [0.0, 3.0]])
+    box = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]])
+    assert outline_overlap(corner, box) == outline_overlap(box, corner) == pytest.approx(1)
+    assert outline_overlap(corner, box + 1.5) == 0  # within its hull alone
+    assert outline_overlap(corner, box + 0.5) == pytest.approx(0.75)
+    crossing = np.array([[0.0, 0.0], [2.0, 2.0], [2.0, 0.0], [0.0, 2.0]])  # two triangles of area 1
+    assert outline_overlap(crossing, box) == pytest.approx(0.5)
+    assert outline_overlap(box, np.zeros((3, 2))) == 0
 
 
 def test_perfect_detections_have_no_errors() -> None:

@@ -25,8 +25,10 @@ from recorder.sensors import Compass, Gps, Lidar
 from recorder.session import Session, SessionOptions, record_session
 from recorder.simulator import Simulator, SimulatorOptions
 from recorder.world import WorldOptions, draw_world
+from replay.ground_truth import GroundTruth
 
 STORE = get_typestore(Stores.ROS2_JAZZY)
+FIXTURES = Path(__file__).parents[1] / "fixtures"
 ROBOT_RADIUS = SimulatorOptions().robot_radius
 
 
@@ -212,6 +214,63 @@ def test_metadata_keep_their_keys_and_name_options_that_are_not_the_defaults(tmp
     assert (simulator["tyre_friction"], simulator["axle"]) == (0.5, SimulatorOptions().track_width)
 
 
+def test_sessions_of_today_are_those_of_earlier_versions(tmp_path: Path) -> None:
+    """New causes of chance and new options change nothing where they are not asked for: the fixtures' first line."""
+    arguments = "--seed 21 --stops 4 4 --rays 120 --per-kind 0-1 --noise-std 0.02 --quiet"
+    assert prim_record(tmp_path / "warped.mcap", *arguments.split()) == 0
+    contents = []
+    for path in (tmp_path / "warped.mcap", FIXTURES / "0.2" / "warped.mcap"):
+        with open_log(path) as log:
+            messages = {topic: [message.data for message in log.messages(topic)] for topic in sorted(log.topics)}
+            metadata = {key: value for key, value in log.metadata["prim"].items() if key != "version"}
+            contents.append((messages, metadata, log.attachment("world.json")))
+    assert contents[0] == contents[1]
+
+
+def test_what_is_drawn_is_in_the_log(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = tmp_path / "a.mcap"
+    code = prim_record(
+        *(path, "--seed", 3, "--clutter", "2-3", "--room", "furniture,L", "--at-walls", 0.02, "--size", 4, 4),
+        *("--per-kind", 1, "--stops", 3, 3, "--rays", 90, "--range-bias", -0.02, "--beam-width", 1.5),
+        *("--quantum", 0.01, "--dropout", 0.2, "--dropout-as", "max", "--outliers", 0.01, "--noise-growth", 0.01),
+    )
+    assert code == 0
+    said = capsys.readouterr().out
+    for words in ("of clutter (", "of structure (", "cupboard", "range bias -20 mm", "beam width 1.5 degrees"):
+        assert words in said
+    with open_log(path) as log:
+        described = {key: json.loads(text) for key, text in log.metadata["prim"].items() if key != "version"}
+        world = World.from_json(json.loads(log.attachment("world.json") or b""))
+        truth = GroundTruth.read(log)
+        ranges = np.concatenate([scan.ranges for _, scan in log.decoded(log.topics[SCAN_TOPIC])])
+    options = {key: described["world"][key] for key in ("clutter", "room", "at_walls")}
+    assert options == {"clutter": [2, 3], "room": ["L", "furniture"], "at_walls": 0.02}
+    assert "touching" not in described["world"]
+    faults = {"range_bias": -0.02, "beam_width": math.radians(1.5), "quantum": 0.01, "noise_growth": 0.01}
+    assert described["lidar"]["faults"] == faults | {"dropouts": 0.2, "dropout_as": "max", "outliers": 0.01}
+    assert 2 <= len(world.clutter) <= 3 and {"wall", "cupboard"} == {solid.name for solid in world.structure}
+    assert truth is not None and truth.at(2**62).solids == world.solids
+    assert np.mean(ranges == 5) == pytest.approx(0.2, abs=0.06)
+    (tmp_path / "world.json").write_text(json.dumps(world.to_json()))
+    assert prim_record(tmp_path / "b.mcap", "--world", tmp_path / "world.json", "--stops", 3, 3) == 0
+    with open_log(tmp_path / "b.mcap") as log:
+        assert World.from_json(json.loads(log.attachment("world.json") or b"")) == world
+
+
+def test_faults_alone_change_nothing_else(tmp_path: Path) -> None:
+    logs = [tmp_path / name for name in ("a.mcap", "b.mcap")]
+    prim_record(logs[0], "--stops", 3, 3, "--rays", 90)
+    prim_record(logs[1], "--stops", 3, 3, "--rays", 90, "--dropout", 0.5)
+    read = []
+    for path in logs:
+        with open_log(path) as log:
+            others = {t: [m.data for m in log.messages(t)] for t in sorted(log.topics) if t != SCAN_TOPIC}
+            read.append((others, np.concatenate([scan.ranges for _, scan in log.decoded(log.topics[SCAN_TOPIC])])))
+    assert read[0][0] == read[1][0]
+    same = read[0][1] == read[1][1]
+    assert same.mean() == pytest.approx(0.5, abs=0.1) and np.isposinf(read[1][1][~same]).all()
+
+
 def test_a_world_is_read_from_a_file(tmp_path: Path) -> None:
     world = World((3.0, 2.0), (Primitive(Kind.SQUARE, 1.0, 0.5, 0.3, (0.2,)),)).with_walls()
     path = tmp_path / "world.json"
@@ -269,6 +328,29 @@ def test_command_line_options_reach_the_log(tmp_path: Path, capsys: pytest.Captu
         (["--rate", "1e-9"], "--rate"),
         (["--range-max", "1e300"], "--range-max"),
         (["--nonsense"], "--nonsense"),
+        (["--clutter", "3-1"], "--clutter 3-1"),
+        (["--clutter", "some"], "--clutter 'some' is neither"),
+        (["--clutter", "2000"], "--clutter is 2000"),
+        (["--room", "attic"], "attic is nothing of a room, which is or has box,"),
+        (["--room", "round,L"], "a room is one of box,round,corridor,L"),
+        (["--room", "round", "--no-walls"], "--room does not go with --no-walls"),
+        (["--room", "furniture", "--size", "0.1", "0.1"], "finds no place on"),
+        (["--at-walls", "0", "--no-walls"], "--at-walls does not go with --no-walls"),
+        (["--at-walls", "-1"], "--at-walls is -1"),
+        (["--at-walls", "0.1", "--touching"], "exclude each other"),
+        (["--world", "a.json", "--touching"], "--world excludes --touching"),
+        (["--world", "a.json", "--clutter", "1"], "--world excludes --clutter"),
+        (["--world", "a.json", "--no-walls"], "--world excludes --no-walls"),
+        (["--range-bias", "nan"], "--range-bias is nan"),
+        (["--range-bias", "-1e9"], "--range-bias is -1e+09"),
+        (["--beam-width", "31"], "--beam-width is 31 degrees"),
+        (["--beam-width", "-1"], "--beam-width"),
+        (["--quantum", "-0.01"], "--quantum"),
+        (["--dropout", "1.5"], "--dropout is 1.5"),
+        (["--dropout", "0.1", "--dropout-as", "none"], "--dropout-as"),
+        (["--dropout-as", "nan"], "--dropout-as needs --dropout"),
+        (["--outliers", "2"], "--outliers is 2"),
+        (["--noise-growth", "-1"], "--noise-growth"),
     ],
 )
 def test_invalid_options_are_refused_by_name(

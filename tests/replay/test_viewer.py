@@ -17,7 +17,9 @@ from prim.errors import OutputError, UsageError
 from prim.log import open_log
 from prim.log.messages import SCAN_TOPIC
 from prim.se2 import Pose2D
-from recorder.session import Session
+from recorder.sensors import Lidar
+from recorder.session import Session, SessionOptions, record_session
+from recorder.world import WorldOptions
 from replay.options import ReplayOptions
 from replay.pipeline import Pipeline
 from replay.result import ReplayResult
@@ -206,6 +208,19 @@ def test_truth_events_and_summary_are_recorded(recording: tuple[Path, ReplayResu
     assert texts == ["23 of 23 scans selected on /scan", "poses: truth (/ground_truth/pose)"]
     assert "precision" in value(rows["/summary"][0], "text")[0]
     assert rows["/timing"]
+
+
+def test_what_is_truly_no_primitive_is_drawn_in_another_grey(tmp_path: Path) -> None:
+    options = SessionOptions(stops=(2, 2), lidar=Lidar(rays=20), world=WorldOptions(per_kind=(1, 1), clutter=(2, 2)))
+    session = record_session(tmp_path / "a.mcap", options)
+    replayed(session.path, tmp_path / "a.rrd", detect=False)
+    rows = rows_of(tmp_path / "a.rrd")
+    outlines = value(rows["/map/truth/others"][0], "strips")
+    assert value(rows["/map/truth/others"][0], "labels") == [solid.name for solid in session.world.clutter]
+    for outline, solid in zip(outlines, session.world.clutter, strict=True):
+        assert np.array(outline)[:-1, :2] == pytest.approx(np.array(solid.outline), abs=1e-6)
+    greys = [value(rows[f"/map/truth/{name}"][0], "colors") for name in ("primitives", "others")]
+    assert greys[0] != greys[1] and len(value(rows["/map/truth/primitives"][0], "strips")) == 5
 
 
 def test_a_blueprint_is_saved_with_the_recording(recording: tuple[Path, ReplayResult]) -> None:

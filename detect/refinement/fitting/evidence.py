@@ -20,7 +20,7 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-from detect.refinement.fitting.fit import SPECIAL_CASES, KindFit
+from detect.refinement.fitting.fit import SPECIAL_CASES, KindFit, nearest_name
 from detect.refinement.likelihood.geometry import JACOBIANS, NUMBERS, OUTLINES, primitive_of
 from detect.refinement.likelihood.kernels import (
     BACKGROUND,
@@ -108,7 +108,7 @@ def _log_determinant(matrix: FloatArray) -> float:
 
 @dataclass(frozen=True)
 class KindPosterior:
-    """The posterior of one kind's own parameters (K,).
+    """The posterior of one kind's own parameters (K,), or of one of its modes.
 
     Attributes:
         mean: (K,).
@@ -124,58 +124,255 @@ class KindPosterior:
 
 
 def importance_sample(
-    fit: KindFit, bundle: RayBundle, sensor: BeamModel, options: EvidenceOptions = DEFAULTS.evidence
-) -> KindPosterior:
-    """Compute a kind's posterior and evidence by adaptive importance sampling, each round drawn from the last one's.
+    fits: Sequence[KindFit], bundle: RayBundle, sensor: BeamModel, options: EvidenceOptions = DEFAULTS.evidence
+) -> list[KindPosterior]:
+    """Compute the posterior and evidence of a kind's modes by adaptive importance sampling.
+
+    Each round is drawn from the posterior as the one before has it, each mode by itself. The samples of all modes'
+    last rounds are weighted as drawn from the mixture of their proposals (the balance heuristic; Veach and Guibas
+    1995), so that nothing counts twice where modes overlap: evidences of modes add up to that of the kind.
 
     Args:
-        fit: The maximum-likelihood fit.
+        fits: The modes of one kind, as :func:`detect.refinement.fitting.fit.distinct_modes` names them.
         bundle: The rays.
         sensor: The sensor.
         options: The prior and the sampler's numbers.
 
     Returns:
-        The posterior; its log evidence is -inf where no sample is a shape that the prior allows, or where the fit's
-        information is not finite.
+        The posterior of each mode; its log evidence is -inf where no sample is a shape that the prior allows, or
+        where the fit's information is not finite.
+    """
+    drawn = [_draw_last_round(fit, bundle, sensor, options) for fit in fits]
+    rounds = [one for one in drawn if isinstance(one, Round)]
+    posteriors = iter(_posteriors_of(rounds, sensor, options))
+    return [next(posteriors) if isinstance(one, Round) else one for one in drawn]
+
+
+@dataclass(frozen=True)
+class Anchor:
+    """Which point of a shape keeps its place as the shape turns and grows: where rays see one side only, that side.
+
+    Samples are drawn of the anchor's place in that of the centroid's. The posterior of a long, unseen size is curved
+    in the centroid's (it moves sideways as the shape turns), not in the anchor's. The volume is the same.
+
+    Attributes:
+        theta: The fit's angle (rad).
+        shares: (2,) shares of width and height that the centroid lies beyond the anchor, in the shape's own frame;
+            0 where the centroid is the anchor.
+    """
+
+    theta: float
+    shares: FloatArray
+
+    @classmethod
+    def of(cls, fit: KindFit, covariance: FloatArray, options: EvidenceOptions) -> Anchor:
+        """Find the anchor: how the centroid moves with sizes that are unseen.
+
+        Args:
+            fit: The fit.
+            covariance: (5, 5) of its parameters.
+            options: From which relative standard deviation on a size is unseen.
+
+        Returns:
+            The anchor; the centroid itself where all sizes are seen.
+        """
+        shares = np.zeros(2)
+        turn = _rotation(np.array([fit.p[2]]))[0]
+        for axis, size in enumerate((3, 4)):
+            variance = covariance[size, size]
+            if fit.kind.has_angle and variance > (options.unseen_size * fit.p[size]) ** 2:
+                shares[axis] = np.clip(turn[:, axis] @ covariance[:2, size] / variance, -0.5, 0.5)
+        return cls(float(fit.p[2]), shares)
+
+    def moved(self, points: FloatArray, sign: float) -> FloatArray:
+        """Change between the anchor's place and the centroid's.
+
+        Args:
+            points: (N, K) parameters.
+            sign: 1 from the anchor's to the centroid's, -1 for the reverse.
+
+        Returns:
+            (N, K).
+        """
+        if not self.shares.any():
+            return points
+        sizes = points[:, 3:] if points.shape[1] > 4 else np.repeat(points[:, 3:], 2, axis=1)
+        turns = _rotation(points[:, 2]) - _rotation(np.array([self.theta]))
+        moved = points.copy()
+        moved[:, :2] += sign * np.einsum("nij,nj->ni", turns, sizes * self.shares)
+        return moved
+
+    def linear(self, p: FloatArray, size: int) -> FloatArray:
+        """Return the Jacobian of the anchor's parameters by the centroid's at the fit.
+
+        Args:
+            p: (5,) the fit's parameters.
+            size: How many own parameters the kind has.
+
+        Returns:
+            (K, K).
+        """
+        made = np.eye(size)
+        if self.shares.any():
+            cos, sin = math.cos(self.theta), math.sin(self.theta)
+            made[:2, 2] = -np.array([[-sin, -cos], [cos, -sin]]) @ (p[3:] * self.shares)
+        return made
+
+
+def _rotation(theta: FloatArray) -> FloatArray:
+    """Return the rotation matrices (N, 2, 2) of angles (N,)."""
+    cos, sin = np.cos(theta), np.sin(theta)
+    return np.stack((np.stack((cos, -sin), axis=-1), np.stack((sin, cos), axis=-1)), axis=-2)
+
+
+@dataclass(frozen=True)
+class Round:
+    """Samples of one mode, drawn from Student's t.
+
+    Attributes:
+        split: The cost function.
+        anchor: In whose place of the centroid's the proposal is Student's t.
+        mean: (K,) of the proposal.
+        lower: (K, K) the Cholesky factor of its covariance's scale.
+        points: (N, K), by the centroid.
+        log_weight: (N,) log-likelihood over the proposal's density; -inf where there is no such shape.
+    """
+
+    split: SplitCost
+    anchor: Anchor
+    mean: FloatArray
+    lower: FloatArray
+    points: FloatArray
+    log_weight: FloatArray
+
+    @property
+    def effective(self) -> float:
+        """The effective sample size (Kong 1992)."""
+        weight = np.exp(self.log_weight - self.log_weight.max())
+        return float(weight.sum() ** 2 / (weight**2).sum())
+
+
+def _draw_last_round(
+    fit: KindFit, bundle: RayBundle, sensor: BeamModel, options: EvidenceOptions
+) -> Round | KindPosterior:
+    """Draw rounds of samples around a fit, each from the last one's posterior; return the last one.
+
+    There are more rounds where its effective sample size is small. Where there is no posterior, one without evidence
+    is returned.
     """
     jacobian = JACOBIANS[fit.kind]
     size = jacobian.shape[1]
     own = jacobian / (jacobian**2).sum(axis=0)
-    at = fit.p @ own
-    floor = np.array(options.min_std) @ own
+    floor = _floor(fit.kind, options)
     information = fit.information / sensor.dispersion + np.eye(size)
     inverse = linear_algebra.inverse(information)
-    impossible = KindPosterior(at, np.diag(floor**2), -math.inf, fit.cost)
+    impossible = KindPosterior(fit.p @ own, np.diag(floor**2), -math.inf, fit.cost)
     if inverse is None:
         return impossible
-    mean, spread = at, _bounded(inverse, fit.kind, floor, options)
+    spread = _bounded(inverse, fit.kind, floor, options)
     wide = jacobian @ (options.sure_deviations**2 * spread) @ jacobian.T
+    anchor = Anchor.of(fit, jacobian @ spread @ jacobian.T, options)
+    change = anchor.linear(fit.p, size)
+    mean, spread = fit.p @ own, change @ spread @ change.T if anchor.shares.any() else spread
     split = SplitCost.of(fit, wide, bundle, sensor, options)
-    rounds = _draws(size, options)
-    for count, (standard, log_density) in enumerate(rounds, start=1):
+    planned = [*options.samples, *options.more_samples]
+    for number, (standard, log_density) in enumerate(_draws(size, options), start=1):
         lower = linear_algebra.cholesky(spread)
         if lower is None:
             return impossible
-        points = mean + standard @ lower.T
+        drawn = mean + standard @ lower.T
+        points = anchor.moved(drawn, 1.0)
         cost = split.costs(points @ jacobian.T)
         log_weight = -cost / sensor.dispersion - log_density + np.log(np.diag(lower)).sum()
         log_weight[~(np.isfinite(log_weight) & (np.abs(points) <= MAX_COORDINATE).all(axis=1))] = -math.inf
         if not np.isfinite(log_weight).any():
             return impossible
+        made = Round(split, anchor, mean, lower, points, log_weight)
+        enough = number >= len(options.samples) and made.effective >= options.enough_effective
+        if enough or number == len(planned):
+            break
         weight = np.exp(log_weight - log_weight.max())
-        last = count == len(rounds)
-        share = _tempered(weight, options.min_effective_last if last else options.min_effective, options)
-        mean = share @ points
-        centred = points - mean
-        covariance = (share[:, None] * centred).T @ centred
+        mean, covariance = _moments(drawn, _tempered(weight, options.min_effective * len(weight), options))
         spread = _bounded(covariance, fit.kind, floor, options)
-    log_evidence = float(log_weight.max() + np.log(weight.mean())) + log_prior(fit.kind, options)
-    return KindPosterior(
-        mean,
-        covariance + np.diag(floor**2) / 100,
-        log_evidence,
-        float(split.costs((jacobian @ mean)[None])[0]),
-    )
+    return made
+
+
+def _floor(kind: Kind, options: EvidenceOptions) -> FloatArray:
+    """Return the least standard deviations (K,) of a proposal, by a kind's own parameters."""
+    jacobian = JACOBIANS[kind]
+    return np.asarray(np.array(options.min_std) @ (jacobian / (jacobian**2).sum(axis=0)))
+
+
+def _moments(points: FloatArray, share: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return the mean (K,) and covariance (K, K) of points (N, K) with weights (N,) that sum to 1."""
+    mean = share @ points
+    centred = points - mean
+    return mean, (share[:, None] * centred).T @ centred
+
+
+def _posteriors_of(rounds: Sequence[Round], sensor: BeamModel, options: EvidenceOptions) -> list[KindPosterior]:
+    """Return the posteriors of a kind's modes from the samples of all of them.
+
+    A sample counts for each mode by the share of that mode's proposal in the density of the mixture there.
+    """
+    if not rounds:
+        return []
+    kind = rounds[0].split.fit.kind
+    counts = np.array([len(one.points) for one in rounds])
+    points = np.concatenate([one.points for one in rounds])
+    log_weight = np.concatenate([one.log_weight for one in rounds])
+    shares = np.ones((1, len(points)))
+    if len(rounds) > 1:
+        densities = np.array([_log_density(one, points, options) for one in rounds])
+        densities += np.log(counts / counts.sum())[:, None]
+        mixture = np.logaddexp.reduce(densities)
+        shares = np.exp(densities - mixture)
+        own = np.repeat(np.arange(len(rounds)), counts), np.arange(len(points))
+        log_weight = log_weight + densities[own] - np.log(counts / counts.sum())[own[0]] - mixture
+    weight = np.exp(log_weight - log_weight.max())
+    posteriors = []
+    for one, share in zip(rounds, shares, strict=True):
+        part = weight * share
+        least = options.min_effective_last * len(one.points)
+        mean, covariance = _moments(points, _tempered(part, least, options))
+        log_evidence = float(log_weight.max() + np.log(part.mean())) + log_prior(kind, options)
+        cost = float(one.split.costs((JACOBIANS[kind] @ mean)[None])[0])
+        covariance = covariance + np.diag(_floor(kind, options) ** 2) / 100
+        posteriors.append(KindPosterior(mean, covariance, log_evidence, cost))
+    return posteriors
+
+
+def _log_density(one: Round, points: FloatArray, options: EvidenceOptions) -> FloatArray:
+    """Return the log density (N,) at points (N, K) of the proposal that a round was drawn from."""
+    standard = np.linalg.solve(one.lower, (one.anchor.moved(points, -1.0) - one.mean).T)
+    scale = float(np.log(np.diag(one.lower)).sum())
+    return np.asarray(_log_density_of_t((standard**2).sum(axis=0), len(one.mean), options.degrees) - scale)
+
+
+def mixture(kind: Kind, modes: Sequence[KindPosterior]) -> KindPosterior:
+    """Compute the posterior of a kind from those of its modes.
+
+    Args:
+        kind: The kind.
+        modes: The posteriors of its modes.
+
+    Returns:
+        The mean of the likeliest mode; the covariance of the whole mixture about it, sum of w (C + d d^T) over modes
+        with weights w, covariances C and displacements d of their means, each by the nearest name of its shape; and
+        the sum of the evidences.
+    """
+    best = max(modes, key=lambda mode: mode.log_evidence)
+    if len(modes) == 1 or best.log_evidence == -math.inf:
+        return best
+    weights = np.exp([mode.log_evidence - best.log_evidence for mode in modes])
+    jacobian = JACOBIANS[kind]
+    own = jacobian / (jacobian**2).sum(axis=0)
+    covariance = np.zeros_like(best.covariance)
+    for weight, mode in zip(weights / weights.sum(), modes, strict=True):
+        p, order = nearest_name(kind, jacobian @ mode.mean, jacobian @ best.mean)
+        apart = p @ own - best.mean
+        covariance += weight * (mode.covariance[np.ix_(order, order)] + np.outer(apart, apart))
+    return replace(best, covariance=covariance, log_evidence=best.log_evidence + math.log(weights.sum()))
 
 
 @dataclass(frozen=True)
@@ -231,11 +428,11 @@ class SplitCost:
         return np.asarray(expansion + exact_costs(self.fit.kind, shapes, self.unsure, self.sensor, self.options))
 
 
-def _tempered(weight: FloatArray, min_share: float, options: EvidenceOptions) -> FloatArray:
-    """Return normalised importance weights, tempered until their effective sample size is this share at least."""
+def _tempered(weight: FloatArray, least: float, options: EvidenceOptions) -> FloatArray:
+    """Return normalised importance weights, tempered until their effective sample size is this at least."""
     power = 1.0
     share = weight / weight.sum()
-    while 1 / (share**2).sum() < min_share * len(weight) and power > options.min_power:
+    while 1 / (share**2).sum() < least and power > options.min_power:
         power *= options.tempering
         share = weight**power / (weight**power).sum()
     return np.asarray(share)
@@ -260,14 +457,18 @@ def _draws(size: int, options: EvidenceOptions) -> list[tuple[FloatArray, FloatA
     rounds = []
     rng = np.random.default_rng(size)
     nu = options.degrees
-    constant = math.lgamma((nu + size) / 2) - math.lgamma(nu / 2) - size / 2 * math.log(math.pi * nu)
-    for count in options.samples:
+    for count in (*options.samples, *options.more_samples):
         normal = rng.standard_normal((count // 2, size))
         half = normal * np.sqrt(nu / rng.chisquare(nu, count // 2))[:, None]
         points = np.concatenate((half, -half))
-        density = constant - (nu + size) / 2 * np.log1p((points**2).sum(axis=1) / nu)
-        rounds.append((points, density))
+        rounds.append((points, _log_density_of_t((points**2).sum(axis=1), size, nu)))
     return rounds
+
+
+def _log_density_of_t(squares: FloatArray, size: int, nu: float) -> FloatArray:
+    """Return the log density (N,) of Student's t in so many dimensions, at these squared distances (N,)."""
+    constant = math.lgamma((nu + size) / 2) - math.lgamma(nu / 2) - size / 2 * math.log(math.pi * nu)
+    return np.asarray(constant - (nu + size) / 2 * np.log1p(squares / nu))
 
 
 def exact_costs(
@@ -327,10 +528,10 @@ def compare_kinds(
     """Compare fits of several kinds to the same rays by their evidence, all kinds being equally likely a priori.
 
     Args:
-        fits: One fit for each kind.
+        fits: The modes of each kind.
         bundle: The rays.
         sensor: The sensor.
-        is_possible: Whether a primitive may be there at all; kinds whose posterior mean may not are left out.
+        is_possible: Whether a primitive may be there at all; modes whose posterior mean may not are left out.
         options: The prior and the sampler's numbers.
 
     Returns:
@@ -338,20 +539,27 @@ def compare_kinds(
         evidence.
     """
     fits = [fit for fit in fits if (fit.p[3:] < max_size(fit.kind, options)).all()]
-    if not fits:
+    rated = [(laplace_evidence(fit, sensor.dispersion, options), fit) for fit in fits]
+    rated = [(nats, fit) for nats, fit in rated if math.isfinite(nats)]
+    if not rated:
         return None
-    rough = {fit.kind: laplace_evidence(fit, sensor.dispersion, options) for fit in fits}
-    fits = [fit for fit in fits if math.isfinite(rough[fit.kind])]
-    if not fits:
-        return None
-    rough = {fit.kind: rough[fit.kind] for fit in fits}
+    rough = {
+        kind: max(nats for nats, fit in rated if fit.kind is kind) for kind in dict.fromkeys(f.kind for _, f in rated)
+    }
     top = max(rough.values())
-    contenders = [fit for fit in fits if rough[fit.kind] >= top - options.contender]
-    sampled = {fit.kind: importance_sample(fit, bundle, sensor, options) for fit in contenders}
-    sampled |= _merged_special_cases(fits, sampled, bundle, sensor, options)
-    for kind, posterior in sampled.items():
-        if not is_possible(summarize(kind, posterior)[0]):
-            sampled[kind] = replace(posterior, log_evidence=-math.inf)
+    modes = {
+        kind: [fit for nats, fit in rated if fit.kind is kind and nats >= rough[kind] - options.mode_margin]
+        for kind in rough
+    }
+
+    def sample(kind: Kind) -> KindPosterior:
+        """Return the posterior of a kind; without evidence where no mode is possible."""
+        found = importance_sample(modes[kind], bundle, sensor, options)
+        possible = [mode for mode in found if is_possible(primitive_of(kind, JACOBIANS[kind] @ mode.mean))]
+        return mixture(kind, possible) if possible else replace(found[0], log_evidence=-math.inf)
+
+    sampled = {kind: sample(kind) for kind in rough if rough[kind] >= top - options.contender}
+    sampled |= _merged_special_cases(sampled, lambda kind: sample(kind) if kind in modes else None, options)
     best = max(sampled, key=lambda kind: sampled[kind].log_evidence)
     highest = sampled[best].log_evidence
     if highest == -math.inf:
@@ -361,26 +569,37 @@ def compare_kinds(
         for kind in rough
     }
     kind_probabilities = {kind: weights.get(kind, 0.0) / sum(weights.values()) for kind in Kind}
+    best = next((kind for kind in SPECIAL_CASES if _is_unseen(kind, best, sampled, options)), best)
     primitive, std, covariance = summarize(best, sampled[best])
     return Posterior(primitive, std, covariance, kind_probabilities, sampled[best].cost)
 
 
+def _is_unseen(kind: Kind, best: Kind, sampled: Mapping[Kind, KindPosterior], options: EvidenceOptions) -> bool:
+    """Tell whether a kind's special case is the best only since nobody saw a side: it must not claim its size.
+
+    Then the kind itself is as likely but for its prior, and does not know a size.
+    """
+    if SPECIAL_CASES[kind] is not best or kind not in sampled:
+        return False
+    own = sampled[kind]
+    relative = np.sqrt(np.diag(own.covariance)[-2:]) / own.mean[-2:]
+    near = own.log_evidence > sampled[best].log_evidence - options.unseen_margin
+    return near and bool((relative > options.unseen_size).any())
+
+
 def _merged_special_cases(
-    fits: Sequence[KindFit],
     sampled: Mapping[Kind, KindPosterior],
-    bundle: RayBundle,
-    sensor: BeamModel,
+    sample: Callable[[Kind], KindPosterior | None],
     options: EvidenceOptions,
 ) -> dict[Kind, KindPosterior]:
     """Return squares and circles in the place of rectangles and ellipses whose sizes agree, with both's evidence."""
     merged = {}
     for kind, special in SPECIAL_CASES.items():
-        fit = next((fit for fit in fits if fit.kind is special), None)
-        if fit is None or kind not in sampled:
+        if kind not in sampled or abs(sampled[kind].mean[3] - sampled[kind].mean[4]) > options.same_sizes:
             continue
-        if abs(sampled[kind].mean[3] - sampled[kind].mean[4]) > options.same_sizes:
+        simple = sampled.get(special) or sample(special)
+        if simple is None:
             continue
-        simple = sampled.get(special) or importance_sample(fit, bundle, sensor, options)
         both = np.logaddexp(simple.log_evidence, sampled[kind].log_evidence)
         merged[special] = replace(simple, log_evidence=float(both))
         merged[kind] = replace(sampled[kind], log_evidence=-math.inf)

@@ -3,22 +3,31 @@
 The likelihood is rough and has several local maxima, of which Levenberg and Marquardt's method finds the nearest. So
 each kind is fitted from starts at several angles, and a fit of a special case (a square) starts the general kind (a
 rectangle) too. Jumps of the likelihood at silhouettes are smoothed by a blur that is reduced stage by stage
-(graduated optimisation).
+(graduated optimisation). Of each kind all distinct maxima (modes) that are likely enough are kept, best first.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import numpy as np
 
-from detect.refinement.likelihood.geometry import JACOBIANS, NUMBERS, OUTLINES, parameters_of
-from detect.refinement.likelihood.kernels import PARAMETERS, Schedule, Starts, descend, negative_log_likelihoods
+from detect.refinement.likelihood.geometry import JACOBIANS, NUMBERS, OUTLINES, parameters_of, primitive_of
+from detect.refinement.likelihood.kernels import (
+    PARAMETERS,
+    THETA,
+    Schedule,
+    Starts,
+    descend,
+    negative_log_likelihoods,
+)
 from detect.refinement.likelihood.rays import RayBundle
 from detect.refinement.likelihood.sensor_model import BeamModel
 from detect.refinement.options import DEFAULTS, Descent, FitOptions
+from prim import linear_algebra
 from prim.arrays import FloatArray
 from prim.shapes import Kind, Primitive
 
@@ -141,7 +150,7 @@ def fit_all_kinds(
         options: Numeric parameters.
 
     Returns:
-        The best fit of each kind that is not out of the question.
+        The distinct modes of each kind that is not out of the question, the best one of a kind first.
     """
     begin = [(kind, p) for kind in Kind for p in starts(guess, kind, options)]
     coarse = _fit_each(begin, Subset.of(bundle, options.coarse_rays), sensor, options.coarse, options)
@@ -157,7 +166,7 @@ def fit_all_kinds(
         limit = best[kind] + options.start_cost_margin
         own = [start for cost, start in ranked if start[0] is kind and cost < limit]
         chosen += own[: options.starts_kept] if kind in contenders else []
-    return _best_of_each_kind(chosen, Subset.of(bundle, options.search_rays), sensor, options.fine, options)
+    return _modes_of_each_kind(chosen, Subset.of(bundle, options.search_rays), sensor, options.fine, options)
 
 
 def _ranked(
@@ -183,10 +192,46 @@ def refit(
         options: Numeric parameters.
 
     Returns:
-        The best fit of each kind.
+        The distinct modes of each kind, the best one of a kind first.
     """
     begin = [(fit.kind, fit.p) for fit in fits]
-    return _best_of_each_kind(begin, Subset(bundle), sensor, options.last, options)
+    begin += _scattered(fits, Subset.of(bundle, options.search_rays), sensor, options)
+    return _modes_of_each_kind(begin, Subset(bundle), sensor, options.last, options)
+
+
+def _scattered(fits: Sequence[KindFit], subset: Subset, sensor: BeamModel, options: FitOptions) -> list[Start]:
+    """Return further starts about the best fit of each likely kind: scattered shapes, triangles a quarter turn on."""
+    lowest = min(fit.cost for fit in fits)
+    best = {fit.kind: fit for fit in sorted(fits, key=lambda fit: -fit.cost)}
+    likely = [fit for fit in best.values() if fit.cost <= lowest + options.scatter_cost_margin]
+    quarter_turns = [
+        (fit.kind, p)
+        for fit in likely
+        if fit.kind.any_apex
+        for p in starts(primitive_of(fit.kind, fit.p), fit.kind, options)[1:4:2]
+    ]
+    return quarter_turns + [start for fit in likely for start in _scattered_about(fit, subset, sensor, options)]
+
+
+def _scattered_about(fit: KindFit, subset: Subset, sensor: BeamModel, options: FitOptions) -> list[Start]:
+    """Return the likeliest of shapes that are scattered about a fit, by a multiple of its covariance."""
+    jacobian = JACOBIANS[fit.kind]
+    inverse = linear_algebra.inverse(fit.information / sensor.dispersion + np.eye(jacobian.shape[1]))
+    lower = None if inverse is None else linear_algebra.cholesky(options.scatter**2 * inverse)
+    if lower is None:
+        return []
+    shapes = fit.p + _standard_normal(options.scattered, len(lower)) @ (jacobian @ lower).T
+    shapes = np.ascontiguousarray(shapes[(shapes[:, 3:] > options.min_size).all(axis=1)])
+    cost, numbers = np.empty(len(shapes)), np.full(len(shapes), NUMBERS[fit.kind])
+    negative_log_likelihoods(OUTLINES, numbers, shapes, sensor.data(subset.bundle), options.scatter_blur, cost)
+    likeliest = np.argsort(cost, kind="stable")[: options.scatter_kept]
+    return [(fit.kind, shapes[k]) for k in likeliest.tolist()]
+
+
+@lru_cache(maxsize=8)
+def _standard_normal(count: int, size: int) -> FloatArray:
+    """Return standard normal samples (count, size), the same every time, so that results are reproducible."""
+    return np.random.default_rng(size).standard_normal((count, size))
 
 
 def refit_same_kind(
@@ -206,30 +251,106 @@ def refit_same_kind(
     return _fit_each([(fit.kind, fit.p)], Subset(bundle), sensor, options.last, options)
 
 
-def _best_of_each_kind(
+def _modes_of_each_kind(
     begin: Sequence[Start], subset: Subset, sensor: BeamModel, descent: Descent, options: FitOptions
 ) -> list[KindFit]:
-    """Return the best fit of each kind from some starts, other apexes, and special cases that are no worse."""
-    best: dict[Kind, KindFit] = {}
+    """Return the modes of each kind from some starts, other apexes, and special cases that are no worse."""
+    found: dict[Kind, list[KindFit]] = {}
 
     def keep(fits: Sequence[KindFit]) -> None:
-        for fit in fits:
-            if fit.kind not in best or fit.cost < best[fit.kind].cost:
-                best[fit.kind] = fit
+        for kind in dict.fromkeys(fit.kind for fit in fits):
+            own = [*found.get(kind, []), *(fit for fit in fits if fit.kind is kind)]
+            found[kind] = distinct_modes(own, options)
 
     keep(_fit_each(begin, subset, sensor, descent, options))
     apexes = [
-        (kind, p) for kind, fit in best.items() if kind.any_apex for p in other_apexes(fit.p, options.equilateral)
+        (kind, p)
+        for kind, fits in found.items()
+        if kind.any_apex
+        for p in other_apexes(fits[0].p, options.equilateral)
     ]
     keep(_fit_each(apexes, subset, sensor, descent, options))
     no_better = [
         (kind, p)
         for kind, special in SPECIAL_CASES.items()
-        if special in best and (kind not in best or best[kind].cost > best[special].cost - descent.tolerance)
-        for p in beyond_special_case(kind, best[special].p, options.stretch)
+        if special in found
+        and (kind not in found or found[kind][0].cost > found[special][0].cost - descent.tolerance)
+        for p in beyond_special_case(kind, found[special][0].p, options.stretch)
     ]
     keep(_fit_each(no_better, subset, sensor, descent, options))
-    return list(best.values())
+    return [fit for fits in found.values() for fit in fits]
+
+
+def distinct_modes(fits: Sequence[KindFit], options: FitOptions = DEFAULTS.fit) -> list[KindFit]:
+    """Choose the modes of one kind among its fits: one fit of each, of all that are likely enough.
+
+    Two fits are of the same mode where either lies within ``options.same_mode`` standard deviations of the other, by
+    its information. All modes get those names of their shapes that are nearest to the best one's parameters.
+
+    Args:
+        fits: Fits of one kind.
+        options: When modes are distinct, which are likely enough, and how many are kept.
+
+    Returns:
+        The modes, the likeliest first.
+    """
+
+    def cost(fit: KindFit) -> float:
+        """Return a fit's cost; one that no prior allows must gain something: where sizes are unseen they drift."""
+        is_too_large = bool(fit.p[3:].max() * fit.kind.extent > options.max_extent)
+        return fit.cost + options.too_large_nats * is_too_large
+
+    ordered = sorted(fits, key=cost)
+    modes = ordered[:1]
+    for fit in ordered[1:]:
+        if len(modes) == options.modes_kept or not fit.cost < modes[0].cost + options.mode_cost_margin:
+            break
+        if not any(_is_same_mode(fit, mode, options) for mode in modes):
+            p, order = nearest_name(fit.kind, fit.p, modes[0].p)
+            modes.append(replace(fit, p=p, information=fit.information[np.ix_(order, order)]))
+    return modes
+
+
+def _is_same_mode(fit: KindFit, mode: KindFit, options: FitOptions) -> bool:
+    """Tell whether two fits of one kind are of the same mode."""
+    p, order = nearest_name(fit.kind, fit.p, mode.p)
+    jacobian = JACOBIANS[fit.kind]
+    apart = (p - mode.p) @ (jacobian / (jacobian**2).sum(axis=0))
+    informations = fit.information[np.ix_(order, order)], mode.information
+    return not min(float(apart @ information @ apart) for information in informations) > options.same_mode**2
+
+
+def nearest_name(kind: Kind, p: FloatArray, like: FloatArray) -> tuple[FloatArray, list[int]]:
+    """Choose, of the parameters that name the same shape, those nearest to others.
+
+    Angles are the same modulo the kind's period; where the longer size is first by definition, a shape has a second
+    name, with the sizes exchanged and a quarter turn. Distances are in metres: an angle's is along a circle around
+    the shape.
+
+    Args:
+        kind: The kind.
+        p: (5,) parameters.
+        like: (5,) the others.
+
+    Returns:
+        (5,) parameters of the same shape, and the order in which the kind's own parameters are taken for them.
+    """
+    period, order = kind.row.period, list(range(JACOBIANS[kind].shape[1]))
+    if period is None:
+        return p, order
+    names = [(p, order)]
+    if kind.longer_first:
+        names.append((np.array([p[0], p[1], p[2] + math.pi / 2, p[4], p[3]]), [*order[:3], 4, 3]))
+    reach = math.hypot(like[3], like[4]) / 2
+
+    def turned(name: FloatArray) -> FloatArray:
+        turns = round(float(like[THETA] - name[THETA]) / period)
+        return np.asarray(name + turns * period * np.eye(PARAMETERS)[THETA])
+
+    def distance(name: FloatArray) -> float:
+        return math.hypot(name[3] - like[3], name[4] - like[4], reach * (name[2] - like[2]))
+
+    return min(((turned(name), order) for name, order in names), key=lambda item: distance(item[0]))
 
 
 def beyond_special_case(kind: Kind, p: FloatArray, stretch: float = DEFAULTS.fit.stretch) -> list[FloatArray]:

@@ -123,17 +123,17 @@ class Background:
         ranges: (N,) where they end (m).
         hits_map: (N,) whether that is an occupied cell; the others leave the map there.
         blocked: (N,) whether they end before they come near the primitive.
-        uncertainty: Standard deviation of the ranges (m).
+        uncertainty: (N,) standard deviations of the ranges (m).
     """
 
     ranges: FloatArray
     hits_map: NDArray[np.bool_]
     blocked: NDArray[np.bool_]
-    uncertainty: float
+    uncertainty: FloatArray
 
     def select(self, chosen: NDArray[np.bool_]) -> Background:
         """Return the background of the chosen rays (N,)."""
-        return Background(self.ranges[chosen], self.hits_map[chosen], self.blocked[chosen], self.uncertainty)
+        return Background(self.ranges[chosen], self.hits_map[chosen], self.blocked[chosen], self.uncertainty[chosen])
 
 
 @dataclass(frozen=True)
@@ -162,7 +162,8 @@ class DistanceMap:
         frame = self.frame
         grid = frame.row, frame.col, 1 / frame.resolution
         cast_through_map(self.distances, grid, bundle.rays, bundle.max_range, ranges, hits_map)
-        return Background(ranges, hits_map, hits_map & (ranges < bundle.entry_range), 0.5 * frame.resolution)
+        uncertainty = np.full(len(bundle), 0.5 * frame.resolution)
+        return Background(ranges, hits_map, hits_map & (ranges < bundle.entry_range), uncertainty)
 
 
 def background_log_likelihood(bundle: RayBundle, background: Background, sensor: BeamModel) -> FloatArray:
@@ -227,7 +228,7 @@ def table_nearest(table: FloatArray, outcomes: NDArray[np.int8], x: FloatArray) 
 
 
 def surface_likelihood(
-    bundle: RayBundle, ranges: FloatArray, hits_map: NDArray[np.bool_], uncertainty: float, sensor: BeamModel
+    bundle: RayBundle, ranges: FloatArray, hits_map: NDArray[np.bool_], uncertainty: FloatArray, sensor: BeamModel
 ) -> FloatArray:
     """Compute the likelihood of measurements where rays end at given ranges, or leave the map there.
 
@@ -237,7 +238,7 @@ def surface_likelihood(
         bundle: N rays.
         ranges: (N,) where they end or leave (m).
         hits_map: (N,) whether they end.
-        uncertainty: Standard deviation of these ranges (m).
+        uncertainty: (N,) standard deviations of these ranges (m).
         sensor: The sensor.
 
     Returns:
@@ -245,7 +246,7 @@ def surface_likelihood(
     """
     z, outcomes, options = bundle.rays[RANGE], bundle.outcomes, sensor.options
     uniform = _uniform_density(sensor.std, sensor.span)
-    wide = math.hypot(sensor.std, uncertainty)
+    wide = np.hypot(sensor.std, uncertainty)
     at_surface = np.exp(table_nearest(sensor.table, outcomes, (ranges - z) / wide))
     at_surface *= np.where(outcomes == MEASURED, sensor.std / wide, 1.0)
     passed = np.full(len(z), NO_RETURN, np.int8)

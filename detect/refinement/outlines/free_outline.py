@@ -81,7 +81,15 @@ class StarOutline:
         return cls(centre, vertices / radii[:, None], radii, _harmonics(turn, options.harmonics))
 
     def deformed(self, coefficients: FloatArray, options: OutlineOptions = DEFAULTS.outline) -> FloatArray:
-        """Return the outline's vertices (V, 2) where the harmonics have these coefficients (2 H + 1,)."""
+        """Deform the outline.
+
+        Args:
+            coefficients: (2 H + 1,) of the harmonics.
+            options: Bounds of the deformation.
+
+        Returns:
+            The vertices (V, 2) in m.
+        """
         growth = np.clip(self.basis @ coefficients, *options.growth)
         return np.asarray(self.centre + (self.radii * np.exp(growth))[:, None] * self.directions)
 
@@ -115,7 +123,16 @@ def _harmonics(turn: FloatArray, count: int) -> FloatArray:
 
 @lru_cache(maxsize=8)
 def prior_precision(amplitude: float, harmonics: int, decay: float) -> FloatArray:
-    """Return the prior's precision (2 H + 1,) of the coefficients: variance amplitude² k^(-2 decay), k from 1."""
+    """Compute the prior's precision: harmonic k has the variance amplitude² k^(-2 decay), the constant amplitude².
+
+    Args:
+        amplitude: The standard deviation of the first harmonic's.
+        harmonics: How many harmonics.
+        decay: By which power of k the standard deviation falls.
+
+    Returns:
+        The precision (2 H + 1,).
+    """
     order = np.concatenate(([1.0], np.repeat(np.arange(1.0, harmonics + 1), 2)))
     return np.asarray(order ** (2 * decay) / amplitude**2)
 
@@ -142,7 +159,15 @@ class OutlineCost:
         self._gradient, self._information = np.zeros(size), np.zeros((size, size))
 
     def expand(self, coefficients: FloatArray, blur: float) -> _Expansion:
-        """Compute the cost with its derivatives at a blur (m)."""
+        """Compute the cost with its derivatives.
+
+        Args:
+            coefficients: (2 H + 1,) of the harmonics.
+            blur: Half-width (m) of silhouettes.
+
+        Returns:
+            The expansion there.
+        """
         vertices = self._star.deformed(coefficients, self._options)
         cost = outline_likelihood(vertices, self._data, blur, self._gradient, self._information)
         count = len(coefficients)
@@ -153,7 +178,15 @@ class OutlineCost:
         return _Expansion(coefficients, scale * cost, scale * gradient, scale * information)
 
     def radial_std(self, there: _Expansion, precision: FloatArray) -> float:
-        """Return the median standard deviation (m) of the vertices along the radius, given the prior's precision."""
+        """Compute how well the outline is known.
+
+        Args:
+            there: The expansion at the fit.
+            precision: (2 H + 1,) the prior's.
+
+        Returns:
+            The median standard deviation (m) of the vertices along the radius.
+        """
         covariance = linear_algebra.inverse(there.information + np.diag(precision))
         if covariance is None:
             return math.inf
@@ -162,7 +195,15 @@ class OutlineCost:
         return float(np.median(growth * self._star.radii * np.exp(basis @ there.coefficients)))
 
     def at(self, coefficients: FloatArray, blur: float) -> float:
-        """Compute the cost alone."""
+        """Compute the cost alone.
+
+        Args:
+            coefficients: (2 H + 1,) of the harmonics.
+            blur: Half-width (m) of silhouettes.
+
+        Returns:
+            Nats, over the dispersion.
+        """
         vertices = self._star.deformed(coefficients, self._options)
         cost = outline_likelihood(vertices, self._data, blur, NO_GRADIENT, NO_INFORMATION)
         return float(cost) / self._dispersion
@@ -194,7 +235,15 @@ def score_test(cost: OutlineCost, blur: float, options: OutlineOptions = DEFAULT
 
 
 def occam(information: FloatArray, precision: FloatArray) -> float:
-    """Return half the log-determinant of 1 + information / precision: what free coefficients cost (nats)."""
+    """Compute what free coefficients cost: half the log-determinant of 1 + information / precision.
+
+    Args:
+        information: (K, K) of the rays on them.
+        precision: (K,) the prior's.
+
+    Returns:
+        Nats.
+    """
     scaled = np.eye(len(precision)) + information / np.sqrt(precision[:, None] * precision)
     logarithm = linear_algebra.log_determinant(scaled)
     return math.inf if logarithm is None else 0.5 * logarithm

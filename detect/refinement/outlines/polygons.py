@@ -25,9 +25,6 @@ from prim import linear_algebra
 from prim.arrays import FloatArray
 from prim.shapes import Primitive
 
-TINY = 1e-12
-"""m; of neighbours that coincide."""
-
 NO_GRADIENT = np.zeros(0)
 NO_INFORMATION = np.zeros((0, 0))
 
@@ -209,7 +206,8 @@ def std_across(vertices: FloatArray, covariance: FloatArray) -> float:
         The median standard deviation (m) of the vertices across the outline.
     """
     along = np.roll(vertices, -1, axis=0) - np.roll(vertices, 1, axis=0)
-    across = np.column_stack((along[:, 1], -along[:, 0])) / np.maximum(np.hypot(*along.T), TINY)[:, None]
+    length = np.hypot(*along.T)
+    across = np.column_stack((along[:, 1], -along[:, 0])) / np.where(length > 0, length, 1.0)[:, None]
     corner = np.arange(len(vertices))
     blocks = covariance.reshape(len(vertices), 2, len(vertices), 2)[corner, :, corner, :]
     variance = np.einsum("vi,vij,vj->v", across, blocks, across)

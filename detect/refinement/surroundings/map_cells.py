@@ -163,6 +163,9 @@ class MapCells:
     def without(self, primitives: Sequence[Primitive], margin: float) -> NDArray[np.bool_]:
         """Return the occupied cells (rows, cols) but for those of primitives.
 
+        Noise blurs a primitive into cells around it: those that are connected with its own, and belong to nothing
+        larger, are its own too.
+
         Args:
             primitives: The primitives.
             margin: Cells this near (m) are a primitive's; of walls' cells, those that all but touch it.
@@ -176,7 +179,16 @@ class MapCells:
             rows, cols, points = _cells_around(self.frame, primitive, primitive.bounding_radius + margin)
             near, touching = (is_within(primitive, points, reach) for reach in (margin, touch))
             occupied[rows, cols] &= ~np.where(self.large[rows, cols], touching, near)
+            self._remove_connected(occupied, primitive, margin)
         return occupied
+
+    def _remove_connected(self, occupied: BoolGrid, primitive: Primitive, margin: float) -> None:
+        """Remove the cells from ``occupied`` that are connected with a primitive's, and no further than its blur."""
+        reach = primitive.bounding_radius + self.options.blur
+        rows, cols, points = _cells_around(self.frame, primitive, reach)
+        labels, small = self.labels[rows, cols], ~self.large[rows, cols]
+        own = np.unique(labels[is_within(primitive, points, margin) & small & (labels > 0)])
+        occupied[rows, cols] &= ~(np.isin(labels, own) & small & is_within(primitive, points, self.options.blur))
 
 
 def _cells_around(frame: GridFrame, primitive: Primitive, reach: float) -> tuple[slice, slice, FloatArray]:

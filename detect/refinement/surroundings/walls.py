@@ -95,6 +95,14 @@ def walls_behind(
     return made
 
 
+def _stretch_between(line: Line, low: float, high: float, options: WallOptions) -> Primitive:
+    """Return the thin rectangle that stands for a line between two places along it (m)."""
+    nx, ny, d = line
+    at = (low + high) / 2
+    x, y, theta = nx * d - ny * at, ny * d + nx * at, math.atan2(nx, -ny)
+    return Primitive(Kind.RECTANGLE, x, y, theta, (high - low, options.thickness)).canonical()
+
+
 def _in_square(candidate: Primitive, points: FloatArray, reach: float) -> NDArray[np.bool_]:
     """Tell which points (N, 2) are within ``reach`` (m) of a primitive's centroid along both axes."""
     return np.asarray((np.abs(points - (candidate.x, candidate.y)) <= reach).all(axis=1))
@@ -118,7 +126,5 @@ def _stretch(
     if min(lengths) * resolution < options.min_length:
         return None
     low, high = max(float(left.min()), middle - reach - beyond), min(float(right.max()), middle + reach + beyond)
-    at = (low + high) / 2
-    x, y, theta = nx * d - ny * at, ny * d + nx * at, math.atan2(nx, -ny)
-    stretch = Primitive(Kind.RECTANGLE, x, y, theta, (high - low, options.thickness)).canonical()
+    stretch = _stretch_between(line, low, high, options)
     return Wall(guess, stretch, line, cells.large_within(stretch, options.cells * resolution))

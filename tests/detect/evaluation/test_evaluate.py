@@ -8,6 +8,7 @@ import math
 import os
 import subprocess
 import sys
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -16,7 +17,7 @@ import numpy as np
 import pytest
 
 from detect import cli
-from detect.detection import Detection, Detections, Rejection
+from detect.detection import Detection, Detections, Rejection, UnknownObject
 from detect.detector import Detector
 from detect.evaluation import suites, tables
 from detect.evaluation.evaluate import evaluate_detector
@@ -33,6 +34,7 @@ from detect.evaluation.sessions import (
 )
 from detect.networks.weights import KIND_NAMES, SHIPPED, ModelCard
 from detect.networks.yolo import KINDS
+from detect.refinement.options import RefinementOptions
 from detect.training.dataset import DatasetOptions, bounding_box, load_samples, make_dataset, read_image
 from detect.training.thresholds import choose_thresholds
 from prim import console
@@ -256,6 +258,23 @@ def test_results_without_the_mean_average_precision_of_what_is_reported_have_a_d
     )
 
 
+def test_a_closed_world_has_rows_of_its_own(tmp_path: Path) -> None:
+    results = [
+        (condition, "forward", 9, sessions_json(0.4 + 0.5 * closed))
+        for closed in (False, True)
+        for condition in suites.conditions(9, closed)
+    ]
+    markdown, table = tables.write_shipped_report(results, tmp_path)
+    text = markdown.read_text()
+    assert "| warped | 250 | forward | 9 | 0.400 |" in text
+    assert "| warped, closed world | 250 | forward | 9 | 0.900 |" in text
+    named = {line["recorded"] for line in csv.DictReader(table.read_text("utf-8").splitlines())}
+    assert named == {*RecordingMode, *(f"{mode}, closed world" for mode in RecordingMode)}
+    summary = tables.shipped_summary(results, RecordingMode.WARPED, "forward")
+    assert "0.400" in summary and "0.900" not in summary
+    assert len({condition.slug for condition, *_ in results}) == len(results)
+
+
 def test_the_summary_is_of_one_mode_and_one_mapper() -> None:
     results = [
         (condition, mapper, 24, sessions_json(0.5))
@@ -271,10 +290,10 @@ def test_the_shipped_suite_evaluates_what_is_missing(tmp_path: Path, monkeypatch
     calls: list[tuple[int, str]] = []
 
     def evaluate_sessions(
-        seeds: list[int], options: object, mapper: str, weights: Path, jobs: int | None
+        seeds: list[int], options: object, mapper: str, weights: Path, jobs: int | None, closed_world: bool
     ) -> dict[str, Any]:
         calls.append((len(seeds), mapper))
-        return sessions_json(len(seeds) / 10)
+        return sessions_json(len(seeds) / (20 if closed_world else 10))
 
     monkeypatch.setattr(suites, "evaluate_sessions", evaluate_sessions)
     suite = suites.ShippedSuite(tmp_path, SHIPPED, lambda text: None)
@@ -284,6 +303,11 @@ def test_the_shipped_suite_evaluates_what_is_missing(tmp_path: Path, monkeypatch
     more = suite.run(5, ["det", "forward"], ["driven"])
     counts = {(condition.name, condition.noise_mm, mapper): count for condition, mapper, count, _ in more}
     assert counts["driven", 50, "forward"] == counts["driven", 50, "det"] == 5 and counts["warped", 0, "forward"] == 2
+    closed = suite.run(5, ["forward"], ["driven"], closed_world=True)
+    assert closed[: len(more)] == more  # neither replaces the other's results, of the same sessions
+    assert {(condition.title, value["refined"]["found"][2]) for condition, _, _, value in closed[len(more) :]} == {
+        ("driven, closed world", 0.25)
+    }
     with pytest.raises(UsageError, match="nothing has been measured"):
         suites.ShippedSuite(tmp_path / "none", SHIPPED, lambda text: None).results()
 
@@ -343,6 +367,52 @@ def test_rejected_primitives_count_with_a_share_of_their_probability() -> None:
     rejection = Rejection(Kind.SQUARE, 0.1, 0.0, 0.0, "its sizes are not known", fitted)
     boxes = scored_primitives(Detections((), (rejection, replace(rejection, fitted=None))), [square]).boxes
     assert boxes.score == pytest.approx([0.9 * REJECTED_WEIGHT]) and len(boxes) == 1
+
+
+def test_objects_of_no_kind_count_nowhere() -> None:
+    square = Primitive(Kind.SQUARE, 0.0, 0.0, 0.0, (0.2,))
+    outline = np.array([[0.5, 0.5], [0.7, 0.5], [0.6, 0.8]])
+    thing = UnknownObject(outline, 0.004, 0.7, "it is part of something larger", {Kind.TRIANGLE: 0.3})
+    detection = Detection(square, 0.9, (0, 0, 0, 0), np.zeros((0, 0), np.uint8), None, {Kind.SQUARE: 0.9})
+    alone = Detections((replace(detection, other_probability=0.1),), ())
+    scores = [
+        summarize_sessions([SessionScore.compare([scored_primitives(found, [square])], found.found, [square])])
+        for found in (alone, replace(alone, objects=(thing,)))
+    ]
+    assert scores[0] == scores[1] and scores[0]["found"] == (1, 1, 1)
+
+
+@pytest.mark.parametrize("closed", [False, True])
+def test_a_closed_world_reaches_refinement(monkeypatch: pytest.MonkeyPatch, closed: bool) -> None:
+    given = []
+
+    def refined(detections: Detections, *arguments: Any, options: RefinementOptions) -> tuple[Detections, None]:
+        given.append(options)
+        return detections, None
+
+    monkeypatch.setattr("detect.evaluation.sessions.refine_detections", refined)
+    options = DatasetOptions(sizes=(0, 1), seed=7, rays=(120,), stops=(2,))
+    monkeypatch.setattr("detect.evaluation.sessions.process_pool", lambda jobs: ThreadPoolExecutor(1))
+    evaluate_sessions([7], options, "det", SHIPPED / "det", 1, closed_world=closed)
+    assert given == [replace(RefinementOptions(), closed_world=closed)]
+
+
+def test_a_closed_world_goes_with_the_suite_that_refines(
+    in_tmp: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert console.run(cli.evaluation, "prim-eval", ["w", "--closed-world"]) == 2
+    assert "--closed-world goes with --suite shipped" in capsys.readouterr().err
+    given: list[object] = []
+
+    def run(suite: suites.ShippedSuite, *arguments: object) -> list[suites.ShippedResult]:
+        given.append(arguments[-1])
+        return [(next(suites.conditions(1, True)), "det", 1, sessions_json(0.5))]
+
+    monkeypatch.setattr(suites.ShippedSuite, "run", run)
+    assert console.run(cli.evaluation, "prim-eval", ["w", "--suite", "shipped", "--closed-world", "--quiet"]) == 0
+    assert console.run(cli.evaluation, "prim-eval", ["w", "--suite", "shipped", "--quiet"]) == 0
+    assert given == [True, False]
+    assert "| warped, closed world | 0 | det | 1 |" in Path("w/report/shipped.md").read_text()
 
 
 def test_missing_shipped_weights_are_refused(tmp_path: Path) -> None:

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from detect.detection import Detection, Detections, Rejection
 from detect.refinement.candidates import Candidate, find_backgrounds, fit_candidates
-from detect.refinement.fitting.evidence import exact_costs
+from detect.refinement.fitting.evidence import compare_kinds, exact_costs
 from detect.refinement.fitting.fit import KindFit, other_apexes, refit, starts
 from detect.refinement.likelihood.geometry import JACOBIANS, parameters_of, primitive_of
 from detect.refinement.likelihood.rays import RayBundle, RayCollector, collect_rays
@@ -434,3 +434,50 @@ def test_drifting_poses_widen_standard_deviations() -> None:
     (by_scans_alone,), _ = refine([true], moved, cells, options=without_stretches)
     assert by_stretches is not None and by_scans_alone is not None
     assert all(by_stretches.std[name] > 1.2 * by_scans_alone.std[name] for name in ("x", "y"))
+
+
+def scans_of_a_front(box: Primitive) -> Scans:
+    """Scans of a box in a room from places that see its front (towards -y) alone, with a noise of 20 mm."""
+    rng = np.random.default_rng(0)
+    made = []
+    for k in range(60):
+        pose = Pose2D(float(rng.uniform(-0.05, 0.05)), float(rng.uniform(-0.9, -0.5)), float(rng.uniform(-3, 3)))
+        scan = Scan(k + 1, "laser", -math.pi, 2 * math.pi / 500, 0.032, 5.0, np.zeros(500, np.float32))
+        cos, sin = math.cos(pose.theta), math.sin(pose.theta)
+        ranges = room(box).cast((pose.x, pose.y), scan.directions @ np.array([[cos, sin], [-sin, cos]]))
+        made.append((replace(scan, ranges=(ranges + rng.normal(0, 0.02, 500)).astype(np.float32)), pose))
+    return made
+
+
+@pytest.mark.parametrize("depth", [0.15, 0.45])
+def test_a_side_that_nobody_saw_is_not_known(depth: float) -> None:
+    """The posterior of a box's hidden depth is as wide as the prior, and the box is rejected for it."""
+    box = Primitive(Kind.RECTANGLE, 0.0, depth / 2, 0.0, (0.3, depth)).canonical()
+    taken = scans_of_a_front(box)
+    guess = Primitive(Kind.RECTANGLE, 0.01, 0.1, 0.05, (0.29, 0.2))
+    (made,), _ = refine([guess], taken, MapCells.of(mapped(taken)))
+    assert made is not None and made.primitive.kind is Kind.RECTANGLE
+    along = made.primitive.theta or 0.0
+    names = Kind.RECTANGLE.sizes if abs(math.sin(along)) < 0.7 else Kind.RECTANGLE.sizes[::-1]
+    assert abs(made.primitive.sizes[names[0]] - 0.3) < 4 * made.std[names[0]] < 0.01
+    assert 0.1 < made.std[names[1]] < 0.3
+    assert made.kind_probabilities[Kind.SQUARE] > 0.3
+    assert "not known to within" in rejection_reason(made)
+
+
+def test_a_triangle_with_few_rays_may_have_another_apex() -> None:
+    """Of a nearly equilateral triangle that few rays meet, the other corners are modes too."""
+    true = Primitive(Kind.TRIANGLE, 0.0, 0.0, 0.4, (0.2, 0.177))
+    taken = scans(room(true), 0.3, rays=120, stops=5)
+    (beams,), span, _ = collect_rays(taken, [true], 0.07)
+    sensor = BeamModel.create(0.3, span)
+    candidate = Candidate(true, beams, MapCells.of(mapped(scans(room(true), 0.01))))
+    with ThreadPoolExecutor(1) as pool:
+        find_backgrounds(pool, [candidate], candidate.cells, 0.03)
+    beams = candidate.rays_with_background([candidate], sensor)
+    guess = KindFit(Kind.TRIANGLE, parameters_of(true), 0.0, np.eye(5))
+    modes = [fit for fit in refit([guess], beams, sensor) if fit.kind is Kind.TRIANGLE]
+    turns = [(fit.p[2] - modes[0].p[2]) / (2 * math.pi / 3) for fit in modes]
+    assert {round(turn) % 3 for turn in turns} == {0, 1, 2}
+    posterior = compare_kinds(modes, beams, sensor)
+    assert posterior is not None and posterior.std["theta"] > 0.5

@@ -1,3 +1,4 @@
+import json
 import math
 import struct
 from typing import Any
@@ -28,7 +29,7 @@ from prim.log.messages import (
 from prim.scan import Scan
 from prim.se2 import Pose2D
 from prim.shapes import Kind, Primitive
-from prim.world import World
+from prim.world import Solid, World
 
 STORE = get_typestore(Stores.ROS2_JAZZY)
 FLOATS = st.floats(0, 100, width=32)
@@ -139,6 +140,19 @@ def test_primitives_round_trip() -> None:
         assert primitive.kind is shape.kind
         assert primitive.size == shape.size
         assert (primitive.x, primitive.y, primitive.theta or 0) == pytest.approx((shape.x, shape.y, shape.theta or 0))
+
+
+def test_clutter_and_structure_are_markers_but_no_primitives() -> None:
+    things = [Solid.of(name, np.array([(0, 0), (1, 0), (0.2, 0.3)]) + 2 * k) for k, name in enumerate("abc")]
+    world = World((9, 9), (Primitive(Kind.CIRCLE, 0.1, 0.2, None, (0.1,)),), (), (things[0],), tuple(things[1:]))
+    data = encode_primitives(7, world)
+    assert len(decode(MARKERS_TYPE, data)[1]) == 1
+    markers = {marker.ns: marker for marker in STORE.deserialize_cdr(data, MARKERS_TYPE).markers}
+    assert markers.keys() == {"primitives", "clutter", "structure"}
+    assert json.loads(markers["clutter"].text) == {"clutter": [things[0].to_json()]}
+    assert json.loads(markers["structure"].text) == {"structure": [thing.to_json() for thing in things[1:]]}
+    points = np.array([(point.x, point.y) for point in markers["structure"].points]).reshape(-1, 4)
+    assert np.array_equal(points, np.vstack([thing.as_segments() for thing in things[1:]]))
 
 
 @pytest.mark.parametrize(

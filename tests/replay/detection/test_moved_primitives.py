@@ -7,12 +7,15 @@ from collections.abc import Sequence
 from concurrent.futures import Future
 from dataclasses import replace
 from itertools import pairwise
+from types import ModuleType
+from typing import Any
 
 import numpy as np
 import pytest
 
-from detect.detection import Detection, Detections
+from detect.detection import Detection, Detections, UnknownObject
 from detect.refinement.likelihood.rays import collect_rays
+from detect.refinement.options import RefinementOptions
 from detect.refinement.refine import Effort, refine_detections
 from detect.refinement.standing import Verdict, judge_places
 from detect.refinement.surroundings.map_cells import MapCells
@@ -26,8 +29,9 @@ from prim.world import World
 from recorder.sensors import Lidar
 from recorder.session import SessionOptions, record_session
 from recorder.world import WorldOptions
+from replay.detection import mixed_places, moved_primitives
 from replay.detection.mixed_places import add_disagreement
-from replay.detection.moved_primitives import Look, MovedPrimitives
+from replay.detection.moved_primitives import Look, MovedOptions, MovedPrimitives
 from replay.detection.refiner import RecentScans
 from replay.detection.stage import DetectionResult
 from replay.options import ReplayOptions
@@ -88,7 +92,10 @@ def map_of(scans: Sequence[tuple[Scan, Pose2D]]) -> OccupancyGrid:
 
 def fit_to(scans: list[tuple[Scan, Pose2D]], guess: Primitive) -> Detection:
     wanted = Detections((Detection(guess, 1.0, (0.0, 0.0, 0.0, 0.0), np.zeros((1, 1), np.uint8)),), ())
-    refined, _ = refine_detections(wanted, scans, map_of(scans), NOISE, effort=Effort(max_proposals=0))
+    closed = RefinementOptions(closed_world=True)  # else what was moved within them is an object of no kind
+    refined, _ = refine_detections(
+        wanted, scans, map_of(scans), NOISE, effort=Effort(max_proposals=0), options=closed
+    )
     return refined.found[0]
 
 
@@ -126,6 +133,80 @@ def test_what_was_pushed_within_the_recent_scans_has_error_bars_that_cover_it() 
     (found,) = moved.correct(look, lambda: scans, Effort(max_proposals=0)).found
     assert found.since == 12 and deviations(found, end) < 3
     assert deviations(fit_to(recent, end), end) > 3
+
+
+def test_objects_of_no_kind_stay_but_where_something_has_moved_to() -> None:
+    end = replace(SQUARE, x=SQUARE.x - 0.14)
+    scans = [*scans_of(SQUARE), *later(scans_of(end), 12)]
+    grid, before = map_of(scans), fit_to(scans[:12], SQUARE)
+    far, near = (
+        UnknownObject(np.array([[0.0, 0.0], [0.2, 0.0], [0.0, 0.2]]) + place, 0.004, 0.9, "none", {})
+        for place in ((-0.9, -0.9), (end.x - 0.1, end.y - 0.1))
+    )
+    standing, pushed = scans[:12], scans[12:]
+    for recent, objects in ((standing, (far, near)), (pushed, (far,))):
+        detections = Detections((before,), (), objects=(far, near))
+        look = Look(detections, grid, MapCells.of(grid), NOISE, recent, scans)
+        moved = MovedPrimitives(map_of, lambda _: Detections((), ()), (0.0, 0.0))
+        assert moved.correct(look, lambda: scans, Effort(max_proposals=0)).objects == objects
+
+
+def test_what_was_found_and_is_an_object_to_all_scans_is_sought_by_the_recent_ones() -> None:
+    """A primitive that was pushed is none of the kinds to scans that show it in two places."""
+    end = replace(SQUARE, x=SQUARE.x - 0.14)
+    scans = [*scans_of(SQUARE), *later(scans_of(end), 12)]
+    grid, before = map_of(scans), fit_to(scans[:12], SQUARE)
+    smeared = UnknownObject(np.vstack([SQUARE.outline()[:2], end.outline()[2:]]), 0.004, 0.9, "none", {})
+    cells, detected = MapCells.of(grid), Detections((replace(before, primitive=end),), ())
+    first = Look(Detections((before,), ()), grid, cells, NOISE, scans[:12], scans[:12])
+    second = Look(Detections((), (), objects=(smeared,)), grid, cells, NOISE, scans[12:], scans)
+    for looks, counts in (([first, second], (1, 0)), ([second], (0, 1)), ([first, *[second] * 5], (1, 0))):
+        moved = MovedPrimitives(map_of, lambda _: detected, (0.0, 0.0))
+        for look in looks:
+            answer = moved.correct(look, lambda: scans, Effort(max_proposals=0))
+        assert (len(answer.found), len(answer.objects)) == counts
+        assert all(one.since == 12 and deviations(one, end) < 4 for one in answer.found)
+
+
+def test_what_was_lost_is_sought_at_some_looks_alone() -> None:
+    grid, before = map_of(scans_of(SQUARE)), fit_to(scans_of(SQUARE), SQUARE)
+    cells, recent = MapCells.of(grid), scans_of()
+    maps: list[int] = []
+
+    def watched(scans: Sequence[tuple[Scan, Pose2D]]) -> OccupancyGrid:
+        maps.append(len(scans))
+        return map_of(scans)
+
+    moved = MovedPrimitives(watched, lambda _: Detections((), ()), (0.0, 0.0), options=MovedOptions(looks=2))
+    for found in ((before,), (), (), (), (before,), (before,)):
+        look = Look(Detections(found, ()), grid, cells, NOISE, scans_of(SQUARE), [])
+        moved.correct(look, lambda: recent, Effort(max_proposals=0))
+    assert len(maps) == 2
+
+
+def test_what_moves_is_refined_and_judged_with_the_options_of_the_replay(monkeypatch: pytest.MonkeyPatch) -> None:
+    given = []
+
+    def watched(module: ModuleType, name: str) -> None:
+        call = getattr(module, name)
+
+        def watch(*arguments: Any) -> Any:
+            given.append((name, [one.closed_world for one in arguments if isinstance(one, RefinementOptions)]))
+            return call(*arguments)
+
+        monkeypatch.setattr(module, name, watch)
+
+    watched(moved_primitives, "refine_detections")
+    watched(moved_primitives, "judge_places")
+    watched(mixed_places, "judge_places")
+    scans = [*scans_of(SQUARE), *later(scans_of(replace(SQUARE, x=SQUARE.x - 0.14)), 12)]
+    grid, before = map_of(scans), fit_to(scans[:12], SQUARE)
+    look = Look(Detections((before,), ()), grid, MapCells.of(grid), NOISE, scans[12:], scans)
+    options = RefinementOptions(closed_world=True)
+    moved = MovedPrimitives(map_of, lambda _: Detections((), ()), (0.0, 0.0), options)
+    assert moved.correct(look, lambda: scans, Effort(max_proposals=0)).found
+    assert {name for name, _ in given} == {"refine_detections", "judge_places"} and len(given) > 4
+    assert all(options == [True] for _, options in given)
 
 
 def test_recent_scans_are_those_since_the_last_look_and_enough() -> None:
@@ -182,13 +263,14 @@ def nearest(result: DetectionResult, k: int) -> tuple[float, int, Detection]:
     return distances[index], result.identities[index].id, found[index]
 
 
-def test_the_place_of_a_pushed_primitive_follows_within_two_looks(looks: list[DetectionResult]) -> None:
+def test_the_place_of_a_pushed_primitive_follows_within_three_looks(looks: list[DetectionResult]) -> None:
+    """As soon as the recent scans show it in one place alone: before, it is none of the kinds."""
     steps = [
         abs(b.truth[PUSHED].x - a.truth[PUSHED].x) + abs(b.truth[PUSHED].y - a.truth[PUSHED].y)
         for a, b in pairwise(looks)
     ]
     first = max(k for k, step in enumerate(steps) if step > 1e-3) + 1
-    distances = [nearest(result, PUSHED)[0] for result in looks[first + 1 :]]
+    distances = [nearest(result, PUSHED)[0] for result in looks[first + 2 :]]
     assert max(distances) < 0.04 and np.median(distances) < 0.003
     ids = [nearest(result, PUSHED)[1] for result in looks[first + 2 :]]
     assert len(set(ids)) == 1
