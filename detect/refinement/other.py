@@ -16,7 +16,7 @@ import shapely
 
 from detect.refinement.candidates import Candidate
 from detect.refinement.fitting.evidence import laplace_evidence
-from detect.refinement.fitting.fit import KindFit
+from detect.refinement.fitting.fit import KindFit, refit
 from detect.refinement.likelihood.geometry import primitive_of
 from detect.refinement.likelihood.rays import RayBundle
 from detect.refinement.likelihood.sensor_model import BeamModel
@@ -64,7 +64,8 @@ def free_alternatives(
     Returns:
         Those that differ from the likeliest kind's outline.
     """
-    rated = [(laplace_evidence(fit, sensor.dispersion, candidate.options.evidence), fit) for fit in candidate.fits]
+    fits = refit(candidate.fits, bundle, sensor, candidate.options.fit) if candidate.is_rough else candidate.fits
+    rated = [(laplace_evidence(fit, sensor.dispersion, candidate.options.evidence), fit) for fit in fits]
     rated.sort(key=lambda item: -item[0])
     evidence, best = rated[0]
     deformed = _deformed(candidate, best, bundle, sensor)

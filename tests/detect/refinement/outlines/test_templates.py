@@ -31,7 +31,7 @@ from prim.shapes import Kind, Primitive
 
 NAMED = {template.name: template for template in TEMPLATES}
 EVERY = pytest.mark.parametrize("template", TEMPLATES, ids=lambda template: template.name)
-NOISE, WALL = 0.25, 3.0
+NOISE, BEHIND = 0.25, 0.4
 
 
 def parameters(template: Template, share: float = 0.4) -> FloatArray:
@@ -40,7 +40,7 @@ def parameters(template: Template, share: float = 0.4) -> FloatArray:
 
 
 def rays_of(outline: FloatArray, seed: int = 0) -> tuple[RayBundle, BeamModel]:
-    """Return rays from all around, with a wall 3 m away behind the outline."""
+    """Return rays from all around, with something 0.4 m behind the outline's middle."""
     rng, stops, count = np.random.default_rng(seed), 60, 60
     turn = np.repeat(rng.uniform(0, 2 * math.pi, stops), count)
     far = np.repeat(rng.uniform(0.4, 1.2, stops), count)
@@ -51,9 +51,9 @@ def rays_of(outline: FloatArray, seed: int = 0) -> tuple[RayBundle, BeamModel]:
     rays[:2], rays[2:4], rays[OCCLUSION] = origins, away / np.hypot(*away), FAR
     scan = np.repeat(np.arange(stops, dtype=np.int32), count)
     bundle = RayBundle(rays, np.zeros(len(turn), np.int8), np.zeros(len(turn)), np.full(len(turn), 10.0), scan)
-    rays[RANGE] = np.minimum(ranges_of(outline, bundle), WALL) + rng.normal(0, NOISE, len(turn))
+    rays[RANGE] = np.minimum(ranges_of(outline, bundle), far + BEHIND) + rng.normal(0, NOISE, len(turn))
     sensor = BeamModel.create(NOISE, 10.0)
-    behind = surface_likelihood(bundle, np.full(len(turn), WALL), np.ones(len(turn), np.bool_), 0.0, sensor)
+    behind = surface_likelihood(bundle, far + BEHIND, np.ones(len(turn), np.bool_), 0.0, sensor)
     rays[BACKGROUND] = np.log(behind)
     return bundle, sensor
 
