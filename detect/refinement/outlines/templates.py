@@ -300,7 +300,15 @@ class TemplateFit:
 
 @dataclass(frozen=True)
 class Expansion:
-    """Parameters (K,) of a template, their cost (nats) with the shares' prior, its gradient and curvature."""
+    """A template's cost at some parameters, with its derivatives.
+
+    Attributes:
+        template: The template.
+        q: (K,) its parameters.
+        cost: Nats, with the prior of the shares' log odds.
+        gradient: (K,).
+        curvature: (K, K), positive definite.
+    """
 
     template: Template
     q: FloatArray
@@ -311,7 +319,14 @@ class Expansion:
 
 @dataclass(frozen=True)
 class Cost:
-    """The negative log-likelihood of outlines, over the dispersion, scaled from some of the rays to all."""
+    """The negative log-likelihood of outlines, over the dispersion, scaled from some of the rays to all.
+
+    Attributes:
+        data: The rays.
+        scale: How many rays each stands for, over the dispersion.
+        max_extent: Upper bound (m) of sizes.
+        options: Numeric parameters.
+    """
 
     data: RayData
     scale: float
@@ -322,17 +337,45 @@ class Cost:
     def of_rays(
         cls, bundle: RayBundle, about: int, sensor: BeamModel, max_extent: float, options: TemplateOptions
     ) -> Cost:
-        """Make the cost of about so many of a bundle's rays."""
+        """Make the cost of some of a bundle's rays.
+
+        Args:
+            bundle: The rays.
+            about: About how many are used.
+            sensor: The sensor.
+            max_extent: Upper bound (m) of sizes.
+            options: Numeric parameters.
+
+        Returns:
+            The cost, scaled to all rays.
+        """
         stride = max(1, len(bundle) // about)
         data = sensor.data(bundle.select(slice(None, None, stride)))
         return cls(data, stride / sensor.dispersion, max_extent, options)
 
     def of(self, vertices: FloatArray, blur: float) -> float:
-        """Compute it for an outline (V, 2) in m at a blur (m)."""
+        """Compute it for an outline.
+
+        Args:
+            vertices: (V, 2) in m.
+            blur: Half-width (m) of silhouettes.
+
+        Returns:
+            Nats.
+        """
         return float(self.scale * outline_likelihood(vertices, self.data, blur, NO_GRADIENT, NO_INFORMATION))
 
     def expand(self, template: Template, q: FloatArray, blur: float) -> Expansion:
-        """Compute it for a template, with its derivatives; shares are uniform a priori: their log odds are not."""
+        """Compute it for a template, with its derivatives; shares are uniform a priori: their log odds are not.
+
+        Args:
+            template: The template.
+            q: (K,) its parameters.
+            blur: Half-width (m) of silhouettes.
+
+        Returns:
+            The expansion.
+        """
         vertices, jacobian = template.vertices(q), template.jacobian(q)
         gradient, information = np.zeros(vertices.size), np.zeros((vertices.size, vertices.size))
         cost = self.scale * outline_likelihood(vertices, self.data, blur, gradient, information)
@@ -345,7 +388,15 @@ class Cost:
         return Expansion(template, q, cost - float(np.log(density).sum()), slope, curvature + np.diag(diagonal))
 
     def log_evidence(self, there: Expansion, cost: float) -> float:
-        """Approximate the log evidence (nats) by Laplace's method, given the cost and the curvature at the mode."""
+        """Approximate the log evidence by Laplace's method.
+
+        Args:
+            there: The mode, with the curvature there.
+            cost: The cost there (nats).
+
+        Returns:
+            Nats; the prior among templates is in it.
+        """
         logarithm = linear_algebra.log_determinant(there.curvature)
         if logarithm is None:
             return -math.inf
@@ -353,7 +404,17 @@ class Cost:
         return -cost + volume + there.template.log_prior(self.max_extent) - math.log(len(TEMPLATES))
 
     def descend(self, template: Template, q: FloatArray, descent: Descent, least: float) -> Expansion:
-        """Minimise it from parameters (K,) by Levenberg and Marquardt's method at each blur, none below ``least``."""
+        """Minimise it by Levenberg and Marquardt's method.
+
+        Args:
+            template: The template.
+            q: (K,) the parameters that it begins with.
+            descent: Blurs, one after the other, and where to end.
+            least: Lower bound (m) of blurs.
+
+        Returns:
+            The last point, at the last blur.
+        """
         for blur in dict.fromkeys(max(blur, least) for blur in descent.blurs):
             here = self._descend_at(self.expand(template, q, blur), descent, blur)
             q = here.q
