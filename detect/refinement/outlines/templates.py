@@ -427,7 +427,7 @@ class Cost:
             step = linear_algebra.solve(damped, here.gradient)
             if step is None:
                 break
-            there = self.expand(here.template, self._bounded(here.template, here.q - step), blur)
+            there = self.expand(here.template, self.bounded(here.template, here.q - step), blur)
             if there.cost < here.cost:
                 gain, here = here.cost - there.cost, there
                 damping = max(damping * options.damping_after_success, options.min_damping)
@@ -439,8 +439,16 @@ class Cost:
                     break
         return here
 
-    def _bounded(self, template: Template, q: FloatArray) -> FloatArray:
-        """Return parameters with sizes and log odds within their bounds."""
+    def bounded(self, template: Template, q: FloatArray) -> FloatArray:
+        """Keep sizes and log odds within their bounds.
+
+        Args:
+            template: The template.
+            q: (K,) its parameters.
+
+        Returns:
+            (K,) those nearest to them that are allowed.
+        """
         rigid, odds = template.rigid, self.options.max_log_odds
         sizes = np.clip(q[POSE:rigid], self.options.min_size, self.max_extent)
         return np.concatenate((q[:POSE], sizes, np.clip(q[rigid:], -odds, odds)))
@@ -493,7 +501,8 @@ def _first_stage(primitives: Sequence[Primitive], outline: FloatArray, cost: Cos
     options = cost.options
     blur = max(options.first.blurs[-1], least)
     base = cost.of(outline, blur)
-    tried = [(cost.of(template.vertices(q), blur) - base, template, q) for template, q in starts_of(primitives)]
+    starts = [(template, cost.bounded(template, q)) for template, q in starts_of(primitives)]
+    tried = [(cost.of(template.vertices(q), blur) - base, template, q) for template, q in starts]
     points = [
         cost.descend(template, q, options.first, least) for worse, template, q in tried if worse < options.screen
     ]
