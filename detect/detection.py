@@ -88,6 +88,24 @@ class Rejection:
 
 
 @dataclass(frozen=True)
+class SensorErrors:
+    """Errors that all beams of a scanner have in common, as refinement found and corrected them.
+
+    Attributes:
+        range_bias: Measured less true range (m); 0 where no bias is significant.
+        range_bias_std: Its standard deviation (m); None where there is none.
+        nearest_within: The full angle (rad) of a beam within which it reads the nearest surface; 0 where its width
+            does not show.
+        mixed_within: The same, within which two surfaces may give a range between both.
+    """
+
+    range_bias: float = 0.0
+    range_bias_std: float | None = None
+    nearest_within: float = 0.0
+    mixed_within: float = 0.0
+
+
+@dataclass(frozen=True)
 class Detections:
     """Detections and rejected candidates of one map.
 
@@ -97,9 +115,11 @@ class Detections:
         doubtful: Candidates that were rejected for their score alone, with their rejections (which are in
             ``rejected`` too): refinement decides about them.
         objects: What is likeliest none of the kinds, in descending order of score; refinement alone finds them.
+        sensor: Errors of the scanner that refinement corrected; None where it found none.
     """
 
     found: tuple[Detection, ...]
     rejected: tuple[Rejection, ...]
     doubtful: tuple[tuple[Detection, Rejection], ...] = ()
     objects: tuple[UnknownObject, ...] = ()
+    sensor: SensorErrors | None = None

@@ -26,6 +26,7 @@ class DeterministicMapper:
     name = "det"
     counts_visits = False
     noise_std: float | None = None
+    dropout_share: float | None = None
 
     def __init__(self, resolution: float = 0.01, bounds: Bounds | None = None) -> None:
         """Start with an empty map.

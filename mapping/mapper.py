@@ -35,6 +35,10 @@ class Mapper(Protocol):
     def noise_std(self) -> float | None:
         """Standard deviation of the range noise (m), given or estimated; None where the mapper has none."""
 
+    @property
+    def dropout_share(self) -> float | None:
+        """Share of the rays that met something and returned nothing; None where the mapper does not estimate it."""
+
     def update(self, scan: Scan, pose: Pose2D) -> None:
         """Add one scan, or the next piece of one, and update the map.
 

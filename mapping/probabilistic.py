@@ -101,6 +101,7 @@ class ProbabilisticMapper:
 
     name = "prob"
     counts_visits = False
+    dropout_share: float | None = None
 
     def __init__(
         self,

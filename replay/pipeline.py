@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from mapping.grid import GridFrame
 from prim.errors import UsageError, WorldError
@@ -18,6 +19,7 @@ from replay.localization import Localization, localize, pose_scans
 from replay.mapping.bounds import choose_map_bounds
 from replay.mapping.memory import MemoryBudget
 from replay.mapping.stage import blames_log_for_size
+from replay.notes import sensor_notes
 from replay.options import ReplayOptions
 from replay.replay_evaluator import ReplayEvaluator
 from replay.result import ReplayResult, distinct_notes
@@ -25,6 +27,10 @@ from replay.scans.posed_scans import PosedScans
 from replay.scans.scan_log import ScanLog
 from replay.timing import RatePacer, StageTimer
 from replay.viewing.protocol import NullViewer, Scene, Viewer
+
+if TYPE_CHECKING:
+    from detect.detection import SensorErrors
+    from replay.detection.stage import DetectionResult
 
 Progress = Callable[[int, int], None]
 
@@ -236,7 +242,11 @@ class Pipeline:
                 rays=branch.usage.rays,
                 lost=tuple(log.lost),
                 interrupted=self._interrupted,
-                notes=(*notes, *branch.notes(outcome.grid)),
+                notes=(
+                    *notes,
+                    *branch.notes(outcome.grid),
+                    *sensor_notes(_sensor_errors(outcome.detections)),
+                ),
                 messages_lost=log.messages_lost,
                 poses=posed_scans.poses,
                 stamps=scans.stamps,
@@ -274,6 +284,11 @@ class Pipeline:
         except BaseException:
             self.viewer.abandon()
             raise
+
+
+def _sensor_errors(result: DetectionResult | None) -> SensorErrors | None:
+    """Return the errors of the scanner that refinement corrected; None for none."""
+    return result.detections.sensor if result else None
 
 
 def _added(a: Mapping[str, float], b: Mapping[str, float]) -> dict[str, float]:

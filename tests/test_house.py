@@ -31,7 +31,8 @@ ARROWS: dict[str, set[str]] = {
     "detect/refinement/surroundings": {"prim", "mapping", "detect/refinement"},
     "detect/refinement/fitting": {"prim", "detect/refinement", "detect/refinement/likelihood"},
     "detect/refinement/outlines": {
-        "prim", "mapping", "detect/refinement", "detect/refinement/likelihood", "detect/refinement/surroundings",
+        "prim", "mapping", "detect/refinement", "detect/refinement/fitting", "detect/refinement/likelihood",
+        "detect/refinement/surroundings",
     },
     "detect/refinement": {
         "prim", "mapping", "detect", "detect/refinement/fitting", "detect/refinement/likelihood",
@@ -105,7 +106,9 @@ OF_TUPLES = ("_replace", "_make", "_asdict", "_fields")
 NAMES_KINDS = {
     "prim/shapes.py": "the table itself",
     "detect/evaluation/paper.py": "the paper's tables",
+    "detect/refinement/outlines/cuts.py": "a rectangle stands for the second moments of a part",
     "detect/refinement/surroundings/proposals.py": "proposes rectangles",
+    "detect/refinement/touching.py": "a circle around a component",
     "detect/refinement/surroundings/walls.py": "a stretch of a wall is a thin rectangle",
 }
 """Files that name a kind, and why."""

@@ -15,6 +15,12 @@ from detect.refinement.fitting.evidence import laplace_evidence, max_size
 from detect.refinement.fitting.fit import SPECIAL_CASES, KindFit, fit_all_kinds, refit, refit_same_kind
 from detect.refinement.likelihood.geometry import JACOBIANS, parameters_of, primitive_of, ranges_to
 from detect.refinement.likelihood.rays import RayBundle
+from detect.refinement.likelihood.scanner_errors import (
+    NO_ERRORS,
+    ScannerErrors,
+    Surroundings,
+    without_errors,
+)
 from detect.refinement.likelihood.sensor_model import (
     Background,
     BeamModel,
@@ -46,6 +52,9 @@ class Candidate:
         fits: The fits, likeliest kind first.
         fitted_to: The sensor and the rays, with their background, of these fits.
         is_rough: Whether they were made to some of the rays only.
+        errors: Errors of the scanner, which are taken out of its rays.
+        shared_errors: (5, E) by how much its parameters change with one standard deviation of each error of the
+            scanner; None for none.
         outline: Vertices (V, 2) in m of a free outline, where the rays say that no kind fits; else None.
         current: The primitive as far as it is known.
     """
@@ -60,33 +69,48 @@ class Candidate:
     fits: list[KindFit] = field(default_factory=list)
     fitted_to: tuple[BeamModel, RayBundle] | None = None
     is_rough: bool = False
+    errors: ScannerErrors = NO_ERRORS
+    shared_errors: FloatArray | None = None
     outline: FloatArray | None = None
     current: Primitive = field(init=False)
-    _cached: tuple[Background, float, FloatArray] | None = None
+    _cached: tuple[Background, tuple[float, float], FloatArray] | None = None
 
     def __post_init__(self) -> None:
         self.current = self.start
 
-    def rays_with_background(self, others: Sequence[Candidate], sensor: BeamModel) -> RayBundle:
+    def rays_with_background(
+        self,
+        others: Sequence[Candidate],
+        sensor: BeamModel,
+        errors: ScannerErrors | None = None,
+        shape: Primitive | None = None,
+    ) -> RayBundle:
         """Return its rays with what they measure where they miss it: the map, walls and other candidates.
 
         Args:
             others: All candidates; those far away, and itself, are passed over.
             sensor: The sensor.
+            errors: Errors of the scanner that are taken out; None: those that are known.
+            shape: Where it is thought to be, which these depend on; None: where it was fitted last.
 
         Returns:
             Its rays, the rows OCCLUSION and BACKGROUND set.
         """
         background = self.background
         assert background is not None
-        if self._cached is None or self._cached[0] is not background or self._cached[1] != sensor.std:
-            self._cached = background, sensor.std, background_log_likelihood(self.bundle, background, sensor)
+        beams = sensor.std, sensor.dropout_share
+        if self._cached is None or self._cached[0] is not background or self._cached[1] != beams:
+            self._cached = background, beams, background_log_likelihood(self.bundle, background, sensor)
         reach = self.options.map.occluder_distance
         near = [other for other in others if other is not self and centroid_distance(other.start, self.start) < reach]
         shapes = [other.current for other in near if other.outline is None]
-        occluders = [*shapes, *(wall.stretch for wall in self.walls)]
+        walls = [wall.stretch for wall in self.walls]
         occlusion = [ranges_of(other.outline, self.bundle) for other in near if other.outline is not None]
-        return with_background(self.bundle, background, self._cached[2], occluders, sensor, occlusion)
+        errors = self.errors if errors is None else errors
+        if errors != NO_ERRORS:
+            around = Surroundings(background, self._cached[2], shapes, walls, occlusion)
+            return without_errors(self.bundle, around, shape or self.current, sensor, errors)
+        return with_background(self.bundle, background, self._cached[2], [*shapes, *walls], sensor, occlusion)
 
     def keep_rays(self, chosen: NDArray[np.bool_]) -> None:
         """Leave out all rays but the chosen ones (N,)."""
@@ -133,7 +157,11 @@ class Candidate:
 
 
 def fit_candidates(
-    pool: Executor, candidates: Sequence[Candidate], search: Sequence[bool], sensor: BeamModel
+    pool: Executor,
+    candidates: Sequence[Candidate],
+    search: Sequence[bool],
+    sensor: BeamModel,
+    beside: Sequence[Candidate] = (),
 ) -> None:
     """Fit all candidates in parallel, each beside what was known of the others before.
 
@@ -144,8 +172,10 @@ def fit_candidates(
         candidates: The candidates.
         search: For each whether all kinds are fitted from new starts, or from the fits that there are.
         sensor: The sensor.
+        beside: Further candidates that may occlude these, and stay as they are.
     """
-    bundles = [candidate.rays_with_background(candidates, sensor) for candidate in candidates]
+    present = [*candidates, *beside]
+    bundles = [candidate.rays_with_background(present, sensor) for candidate in candidates]
     work = zip(candidates, bundles, search, strict=True)
     list(pool.map(lambda item: _fit_candidate(item[0], item[1], item[2], sensor), work))
 
@@ -180,6 +210,7 @@ def _is_unchanged(
     """Tell whether fits to earlier rays hold for these."""
     before, fitted_to = earlier
     same_noise = abs(before.std - sensor.std) < options.sensor.same_noise * sensor.std
+    same_noise &= abs(before.dropout_share - sensor.dropout_share) <= options.sensor.same_dropouts
     return same_noise and before.footprint == sensor.footprint and fitted_to.is_similar(bundle, options)
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from concurrent.futures import Executor
+from dataclasses import replace
 
 from detect.refinement.candidates import Candidate
 from detect.refinement.likelihood.rays import RayBundle
@@ -13,7 +14,9 @@ from detect.refinement.sensor_estimation import estimate_noise
 from prim.arrays import FloatArray
 
 
-def find_misfits(pool: Executor, candidates: Sequence[Candidate], sensor: BeamModel) -> None:
+def find_misfits(
+    pool: Executor, candidates: Sequence[Candidate], sensor: BeamModel, beside: Sequence[Candidate] = ()
+) -> None:
     """Give a free outline to each candidate whose rays say that no kind fits.
 
     Candidates whose kind is known already are left as they are.
@@ -22,11 +25,11 @@ def find_misfits(pool: Executor, candidates: Sequence[Candidate], sensor: BeamMo
         pool: The threads.
         candidates: The fitted candidates; ``outline`` is set.
         sensor: The sensor so far; its footprint and dispersion are not used, since misfits may have spoilt them.
+        beside: Further candidates that may occlude these.
     """
-    model = BeamModel.create(
-        sensor.std, sensor.span, candidates[0].options.outline.footprint, 1.0, sensor.max_std, sensor.options
-    )
-    bundles = [candidate.rays_with_background(candidates, model) for candidate in candidates]
+    model = replace(sensor, footprint=candidates[0].options.outline.footprint, dispersion=1.0)
+    present = [*candidates, *beside]
+    bundles = [candidate.rays_with_background(present, model) for candidate in candidates]
     work = zip(candidates, bundles, strict=True)
     found = pool.map(lambda item: _better_outline(item[0], item[1], model), work)
     for candidate, outline in zip(candidates, found, strict=True):
@@ -65,7 +68,8 @@ def sensor_without_misfits(
         find_misfits(pool, candidates, sensor)
         std = noise_std or estimate_noise(candidates, sensor)
         settled = abs(std - sensor.std) < options.same_noise * std
-        sensor = BeamModel.create(std, sensor.span, sensor.footprint, 1.0, sensor.max_std, options)
+        dropouts = sensor.dropout_share
+        sensor = BeamModel.create(std, sensor.span, sensor.footprint, 1.0, sensor.max_std, options, dropouts)
         if settled:
             break
     return sensor

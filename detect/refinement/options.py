@@ -41,6 +41,10 @@ class SensorOptions:
     """Probability that a ray which leaves the map meets nothing at all."""
     censored_doubt: float = 0.1
     """Likelihood of a censored measurement (too near, no return) that nothing explains."""
+    min_dropout_share: float = 0.005
+    """A smaller share of dropouts counts as none: ``background_doubt`` times ``censored_doubt`` explains as many."""
+    max_dropout_share: float = 0.3
+    """Where a larger share of beams returns nothing, there is nothing."""
     noise_scans: int = 40
     """Scans whose neighbouring beams bound the noise."""
     max_noise_ratio: float = 2.0
@@ -84,7 +88,67 @@ class SensorOptions:
     misfit_rounds: int = 2
     """How often, at most, what fits no kind is sought with the noise that is known by then."""
     same_noise: float = 0.03
-    """Noise that differs by a smaller share does not make fits anew."""
+    """Noise that differs by a smaller share does not make fits anew,"""
+    same_dropouts: float = 0.01
+    """nor do dropouts whose share differs by no more."""
+    beam_parts: tuple[float, ...] = (0.0, -0.5, 0.5, -1.0, 1.0)
+    """Directions within a wide beam, in half-widths, of which the nearest surface is read: the axis first, so that it
+    stays where none is nearer."""
+    beyond: float = 2.45
+    """Range noises; a range that is more beyond a surface is not explained by that,"""
+    unexplained: float = -3.0
+    """nats; nor by a background whose log-likelihood is less: that is at as many range noises."""
+
+
+@dataclass(frozen=True)
+class ScannerOptions:
+    """Errors that all beams of a scanner have in common, estimated from all candidates together."""
+
+    deviations: float = 5.0
+    """Standard deviations from 0 at which a range bias is told: 1 in 2 million by chance, and models are never exact.
+    """
+    considered: float = 3.0
+    """The same of the bias that the first fits show: with less nothing is fitted anew to find it."""
+    min_bias: float = 0.001
+    """m; a smaller bias is not told."""
+    max_bias: float = 0.05
+    """m; bound of the search: real scanners state 30 mm."""
+    max_step: float = 0.015
+    """m; a step of Gauss and Newton's method is no larger."""
+    steps: int = 5
+    """The most steps; they end where one is below …"""
+    last_step: float = 0.0002
+    """m; … this."""
+    difference: float = 0.25
+    """Range noises; the step of differences by the bias."""
+    agreement: float = 4.0
+    """Standard deviations from the candidates' median, its scatter included, beyond which one has no part."""
+    min_first_gain: float = 4.0
+    """nats a candidate, times the dispersion, by which beams of a width must be likelier than without at first …"""
+    min_gain: float = 10.0
+    """… and once they are taken out; by chance it came to 7."""
+    reaches: tuple[float, ...] = (0.0015, 0.003, 0.006, 0.012, 0.024)
+    """rad; half-widths of beams that are tried: 0.09 to 1.4 degrees."""
+    first_reach: float = 0.003
+    """rad; where none up to this is likelier than no width, for most candidates, no others are tried."""
+    refinements: int = 3
+    """Halvings of the interval around the best."""
+    turns: int = 3
+    """Fits in a row, each with rays turned to the nearest surface of the fit before."""
+    first_footprint: float = 0.001
+    """m; the footprint is no larger where a width is looked for. Where one is known it is 0: jumps show it best."""
+    reach_std: float = 0.0003
+    """rad; standard deviation of a half-width, and of where mixed pixels begin: how a beam's parts make one range is
+    known no better …"""
+    relative_reach_std: float = 0.03
+    """… than this and, as a share of it, this: by how far half-widths of 0.25 to 1 degree came out too small."""
+    mixed: tuple[float, ...] = (0.004, 0.008, 0.012, 0.016, 0.024)
+    """rad; half-widths within which mixed pixels are counted."""
+    min_mixed_share: float = 0.15
+    """Share of mixed pixels, of the rays between two half-widths, from which on the wider one holds them; 0.01 to
+    0.06 are outliers and errors of the map."""
+    min_mixed: int = 20
+    """Mixed pixels; fewer are outliers."""
 
 
 @dataclass(frozen=True)
@@ -234,6 +298,10 @@ class MapOptions:
     """m; a wall that is free on one side only reaches so far to the other."""
     one_sided: float = 0.2
     """Share of free cells, of the other side's, below which a side is not free."""
+    min_opening: float = 0.1
+    """m; a wall is open where it has no cells over this length at least: noise wears smaller holes into walls."""
+    min_span: float = 0.4
+    """m; between openings a wall is as long at least: a primitive may stand in a doorway."""
     penetration: float = 0.025
     """m; what reaches further behind such a wall is no primitive."""
     touching: float = 0.008
@@ -559,6 +627,53 @@ class OtherOptions:
 
 
 @dataclass(frozen=True)
+class TouchingOptions:
+    """When what no kind fits is told apart into two things that touch."""
+
+    around: float = 1.5
+    """cells; a component of the map belongs to a candidate where its cells are this near to it."""
+    max_radius: float = 0.7
+    """m; of the circle around a component; larger ones are no two primitives: EvidenceOptions.max_extent."""
+    reach: float = 0.03
+    """m; rays that pass that circle at this distance are needed."""
+    unexplained: float = 0.25
+    """Share of a component's cells that no candidate covers, above which two things are tried although each
+    candidate fits a kind."""
+    simplification: float = 0.7
+    """cells; tolerance of one of the contours that are cut: a neck may be a cell deep."""
+    min_turn: float = 0.25
+    """rad; an outline is concave where it turns inwards by more."""
+    min_share: float = 0.06
+    """A part has this share of the area at least."""
+    max_mismatch: float = 0.16
+    """Area by which parts and primitives differ, as a share of the whole: above this a partition is not tried."""
+    max_cuts: int = 8
+    """Cuts that are compared by area: the shortest, for the outline that they cut off."""
+    round_vertices: int = 24
+    """Vertices that stand for round shapes there."""
+    tries: int = 3
+    """Partitions that are fitted to the rays, those whose parts are most like primitives,"""
+    alike: float = 0.8
+    """leaving out those whose parts have more than this in common (IoU) with another's."""
+    rounds: int = 3
+    """Fits of the parts beside each other; all but the last are searches."""
+    min_rays: int = 40
+    """Rays that meet each part."""
+    min_nats: float = 15.0
+    """nats; by which one thing is likelier a priori than two that touch, and that are tried in several ways."""
+    sure_nats: float = 100.0
+    """nats; parts that are likelier than one thing by more are not tried otherwise."""
+    max_shared: float = 0.06
+    """Share of the smaller area that parts have in common at most: things do not overlap."""
+    aligned: float = 0.03
+    """rad; sides that differ by less in direction are parallel."""
+    coincidence: float = 0.004
+    """m; lines, or axes, that are no further apart are the same."""
+    gap: float = 0.006
+    """m; parts that are further apart do not touch."""
+
+
+@dataclass(frozen=True)
 class StandingOptions:
     """When the rays of some scans contradict a fit to those of others."""
 
@@ -577,6 +692,7 @@ class RefinementOptions:
 
     rays: RayOptions = field(default_factory=RayOptions)
     sensor: SensorOptions = field(default_factory=SensorOptions)
+    scanner: ScannerOptions = field(default_factory=ScannerOptions)
     fit: FitOptions = field(default_factory=FitOptions)
     evidence: EvidenceOptions = field(default_factory=EvidenceOptions)
     map: MapOptions = field(default_factory=MapOptions)
@@ -590,6 +706,7 @@ class RefinementOptions:
     templates: TemplateOptions = field(default_factory=TemplateOptions)
     contact: ContactOptions = field(default_factory=ContactOptions)
     other: OtherOptions = field(default_factory=OtherOptions)
+    touching: TouchingOptions = field(default_factory=TouchingOptions)
     standing: StandingOptions = field(default_factory=StandingOptions)
     closed_world: bool = False
     """Whether all there is are the kinds and walls: nothing is held against «none of the kinds»."""

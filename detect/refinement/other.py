@@ -22,6 +22,7 @@ from detect.refinement.likelihood.rays import RayBundle
 from detect.refinement.likelihood.sensor_model import BeamModel
 from detect.refinement.options import DEFAULTS, OtherOptions
 from detect.refinement.outlines.contact import contact_of, is_flush
+from detect.refinement.outlines.flush import are_flush
 from detect.refinement.outlines.free_outline import OutlineCost, StarOutline, fit_free_outline, score_test
 from detect.refinement.outlines.polygons import contour_of, fit_polygons, polygon_starts
 from detect.refinement.outlines.templates import fit_templates
@@ -146,13 +147,14 @@ def larger_alternatives(
     options = candidate.options
     outline, found = primitive.outline(), []
     contact = contact_of(
-        primitive, candidate.fitted_rays, candidate.cells, others, candidate.walls, sensor, options.contact
+        primitive, candidate.bundle, candidate.cells, others, candidate.walls, sensor, options.contact
     )
     if contact.cells:
         nats = contact.nats
         reason = f"a part of something larger: its rays are likelier by {nats:.0f} nats with what touches it"
         found.append(Alternative(outline, nats - options.contact.min_nats, 0.0, reason))
-    if is_flush(primitive, candidate.cells, others, options.contact):
+    beside_other = any(are_flush(primitive, other, options.touching) for other in others)
+    if beside_other or is_flush(primitive, candidate.cells, options.contact):
         reason = "one side is flush with what is beside it: as likely a part of that"
         found.append(Alternative(outline, math.log(options.other.flush / len(Kind)), 0.0, reason, is_told=False))
     return found

@@ -21,12 +21,13 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from detect.detection import Detection, Detections, Rejection, UnknownObject
+from detect.detection import Detection, Detections, Rejection, SensorErrors, UnknownObject
 from detect.refinement.candidates import Candidate, find_backgrounds, fit_candidates
 from detect.refinement.fitting.evidence import compare_kinds
 from detect.refinement.likelihood.geometry import parameters_of, ranges_to
 from detect.refinement.likelihood.kernels import BACKGROUND, OCCLUSION
 from detect.refinement.likelihood.rays import RayBundle, collect_rays
+from detect.refinement.likelihood.scanner_errors import NO_ERRORS
 from detect.refinement.likelihood.sensor_model import Background, BeamModel, DistanceMap, surface_likelihood
 from detect.refinement.misfits import sensor_without_misfits
 from detect.refinement.options import DEFAULTS, AcceptanceOptions, OtherOptions, RefinementOptions
@@ -37,9 +38,11 @@ from detect.refinement.other import (
     other_log_odds,
     simple_outline,
 )
-from detect.refinement.sensor_estimation import estimate_noise, estimate_sensor, initial_noise
+from detect.refinement.scanner_errors import correct_scanner_errors, settle_scanner_errors, with_shared_errors
+from detect.refinement.sensor_estimation import estimate_dropouts, estimate_noise, estimate_sensor, initial_noise
 from detect.refinement.surroundings.map_cells import MapCells
 from detect.refinement.surroundings.proposals import propose
+from detect.refinement.touching import Site, Trial, find_sites, tell_apart
 from mapping.grid import OccupancyGrid
 from prim.arrays import FloatArray
 from prim.metrics import overlap_coefficient
@@ -179,7 +182,9 @@ def refine_detections(
     kept: list[Detection] = []
     objects: list[UnknownObject] = []
     rejected = []
-    for number, (guess, result) in enumerate(zip(wanted, refined, strict=True)):
+    results = [*enumerate(refined), *refinement.further]
+    for number, result in results:
+        guess = wanted[number]
         if number < found:
             reason = rejection_reason(result, options.acceptance)
         else:
@@ -196,7 +201,7 @@ def refine_detections(
     rejected.sort(key=lambda rejection: -rejection.score)
     objects.sort(key=lambda found: -found.score)
     noise = refinement.noise_std if kept or objects else None
-    return Detections(tuple(kept), tuple(rejected), objects=tuple(objects)), noise
+    return Detections(tuple(kept), tuple(rejected), objects=tuple(objects), sensor=refinement.sensor), noise
 
 
 def _candidates_of(
@@ -362,6 +367,9 @@ class Refinement:
         guessed_noise: A first guess (m) of the noise, where there is one.
         rounds: Joint fits once duplicates are gone; None: as in the options.
         options: Numeric parameters.
+        sensor: Errors of the scanner that :meth:`run` found and corrected; None where it found none.
+        further: Of things that were told apart by :meth:`run`, those beyond the guesses: with the index of the guess
+            that they were a part of.
     """
 
     cells: MapCells
@@ -370,6 +378,9 @@ class Refinement:
     guessed_noise: float | None = None
     rounds: int | None = None
     options: RefinementOptions = field(default_factory=RefinementOptions)
+    sensor: SensorErrors | None = None
+    further: list[tuple[int, RefinedPrimitive]] = field(default_factory=list)
+    _told_apart: list[Trial] = field(default_factory=list)
 
     def run(
         self,
@@ -395,37 +406,70 @@ class Refinement:
         """
         if not primitives:
             return []
-        bundles, span, max_noise = collect_rays(scans, primitives, self.options.rays.reach, self.options, since)
+        sites = [] if self.options.closed_world else find_sites(self.cells, primitives, self.options)
+        alone = [site for site in sites if site.covered_by is None]
+        circles = [site.circle for site in alone]
+        stamps = list(since or [None] * len(primitives))
+        stamps += [stamps[site.members[0]] for site in alone]
+        reach = self.options.rays.reach
+        bundles, span, max_noise = collect_rays(scans, [*primitives, *circles], reach, self.options, stamps)
+        for site, bundle in zip(alone, bundles[len(primitives) :], strict=True):
+            site.bundle = bundle
         detections = known or {}
         candidates = [
             Candidate(start, bundle, self.cells, detections.get(number), self.options)
-            for number, (start, bundle) in enumerate(zip(primitives, bundles, strict=True))
+            for number, (start, bundle) in enumerate(zip(primitives, bundles, strict=False))
         ]
+        for site in sites:
+            site.take(candidates)
         seen = [candidate for candidate in candidates if len(candidate.bundle)]
         results: dict[int, RefinedPrimitive | None] = {}
         if seen:
             with ThreadPoolExecutor(self.threads) as pool:
-                results = self._refine(pool, seen, candidates[:preferred], span, max_noise)
-        return [results.get(id(candidate)) for candidate in candidates]
+                results = self._refine(pool, seen, candidates[:preferred], sites, span, max_noise)
+        return self._in_order(candidates, results)
+
+    def _in_order(
+        self, candidates: Sequence[Candidate], results: Mapping[int, RefinedPrimitive | None]
+    ) -> list[RefinedPrimitive | None]:
+        """Return the guesses' results: of what was told apart the part most like each; ``further`` has the rest."""
+        numbers = {id(candidate): number for number, candidate in enumerate(candidates)}
+        ordered = [results.get(id(candidate)) for candidate in candidates]
+        self.further = []
+        for trial in self._told_apart:
+            left = list(trial.parts)
+            for guess in trial.site.candidates[: len(left)]:
+                best = max(left, key=lambda part: overlap_coefficient(part.current, guess.start))
+                left.remove(best)
+                ordered[numbers[id(guess)]] = results.get(id(best))
+            first = numbers[id(trial.site.candidates[0])]
+            self.further += [(first, result) for part in left if (result := results.get(id(part)))]
+        return ordered
 
     def _refine(
-        self, pool: Executor, seen: list[Candidate], preferred: list[Candidate], span: float, max_noise: float
+        self,
+        pool: Executor,
+        seen: list[Candidate],
+        preferred: list[Candidate],
+        sites: Sequence[Site],
+        span: float,
+        max_noise: float,
     ) -> dict[int, RefinedPrimitive | None]:
         """Search, remove duplicates, fit jointly, estimate the sensor, and compare kinds; results by id."""
         options, known_noise = self.options, self.noise_std
         noise = known_noise or min(self.guessed_noise or initial_noise(seen, options.sensor), max_noise)
-        sensor = BeamModel.create(noise, span, max_std=max_noise, options=options.sensor)
         find_backgrounds(pool, seen, self.cells, options.map.cleared_first, options)
+        dropouts = estimate_dropouts(seen, noise, options.sensor)
+        sensor = BeamModel.create(noise, span, max_std=max_noise, options=options.sensor, dropout_share=dropouts)
         fit_candidates(pool, seen, [True] * len(seen), sensor)
         single = self._near_rays(without_duplicates(seen, preferred, sensor))
         if not single:
             return {}
         noise = known_noise or estimate_noise(single, sensor)
-        sensor = BeamModel.create(noise, span, max_std=max_noise, options=options.sensor)
+        dropouts = estimate_dropouts(single, noise, options.sensor)
+        sensor = BeamModel.create(noise, span, max_std=max_noise, options=options.sensor, dropout_share=dropouts)
         self._fit_jointly(pool, single, sensor)
-        if not options.closed_world:
-            sensor = sensor_without_misfits(pool, single, sensor, known_noise)
-        sensor = estimate_sensor(single, sensor, known_noise)
+        single, sensor = self._find_sensor(pool, sites, single, sensor)
         disperses = sensor.dispersion > options.sensor.significant_dispersion
         fit_candidates(pool, single, [disperses] * len(single), sensor)
         self.noise_std = sensor.std
@@ -433,6 +477,37 @@ class Refinement:
         finished = pool.map(lambda item: finish(item, whole_map.background(item.bundle), sensor), single)
         results = {id(candidate): result for candidate, result in zip(single, finished, strict=True)}
         return results if options.closed_world else self._beside_others(pool, single, results, sensor)
+
+    def _find_sensor(
+        self, pool: Executor, sites: Sequence[Site], candidates: list[Candidate], sensor: BeamModel
+    ) -> tuple[list[Candidate], BeamModel]:
+        """Estimate the sensor by the candidates that a kind fits, once its errors are taken out of all rays.
+
+        What fits no kind is told apart on the way, where it is two things that do.
+        """
+        noise_std = self.noise_std
+        sensor = correct_scanner_errors(pool, candidates, sensor, noise_std)
+        is_corrected = candidates[0].errors != NO_ERRORS
+        if not self.options.closed_world:
+            sensor = sensor_without_misfits(pool, candidates, sensor, noise_std)
+            candidates, sensor = self._tell_apart(pool, sites, candidates, sensor)
+        sensor, self.sensor = settle_scanner_errors(pool, candidates, sensor, noise_std)
+        if is_corrected and self.sensor is None and not self.options.closed_world:
+            sensor = sensor_without_misfits(pool, candidates, sensor, noise_std)  # with all errors back
+        return candidates, estimate_sensor(candidates, sensor, noise_std)
+
+    def _tell_apart(
+        self, pool: Executor, sites: Sequence[Site], candidates: list[Candidate], sensor: BeamModel
+    ) -> tuple[list[Candidate], BeamModel]:
+        """Put two candidates where one fits no kind and two do; with them the sensor is estimated anew."""
+        self._told_apart = tell_apart(pool, sites, candidates, sensor)
+        if not self._told_apart:
+            return candidates, sensor
+        replaced = {id(candidate) for trial in self._told_apart for candidate in trial.before}
+        parts = [part for trial in self._told_apart for part in trial.parts]
+        present = [*(candidate for candidate in candidates if id(candidate) not in replaced), *parts]
+        self._fit_jointly(pool, present, sensor)
+        return present, sensor_without_misfits(pool, present, sensor, self.noise_std)
 
     def _beside_others(
         self,
@@ -456,11 +531,17 @@ class Refinement:
 
         def larger(one: Candidate) -> list[Alternative]:
             others = [primitive for key, primitive in kept.items() if key != id(one)]
+            others += [part.current for part in self._parts_beside(one) if id(part) not in kept]
             return larger_alternatives(one, kept[id(one)], others, sensor)
 
         for one, parts in zip(rest, pool.map(larger, rest), strict=True):
             beside[id(one)] = _required(results[id(one)]).beside([*shapes[id(one)], *parts], other)
         return beside
+
+    def _parts_beside(self, candidate: Candidate) -> list[Candidate]:
+        """Return the other parts of what a candidate was told apart from."""
+        trials = [trial for trial in self._told_apart if candidate in trial.parts]
+        return [part for trial in trials for part in trial.parts if part is not candidate]
 
     def _near_rays(self, candidates: list[Candidate]) -> list[Candidate]:
         """Leave out rays that pass far from the fits, and candidates without any."""
@@ -547,6 +628,8 @@ def finish(candidate: Candidate, map_alone: Background, sensor: BeamModel) -> Re
     posterior = compare_kinds(candidate.fits, bundle, sensor, candidate.is_possible, evidence)
     if posterior is None:
         return None
+    posterior = with_shared_errors(posterior, candidate.shared_errors)
+    map_alone = map_alone.nearer_by(candidate.errors.range_bias)
     ratio = float(-bundle.rays[BACKGROUND].sum() - posterior.cost)
     sectors = candidate.options.acceptance.sectors
     misfit, rays, seen = _compare_with_map(posterior.primitive, bundle, map_alone, sensor, sectors)

@@ -15,6 +15,7 @@ from detect.refinement.fitting.fit import KindFit
 from detect.refinement.likelihood.geometry import JACOBIANS, NUMBERS, OUTLINES, ranges_to
 from detect.refinement.likelihood.kernels import (
     MEASURED,
+    NO_RETURN,
     OCCLUSION,
     PARAMETERS,
     RANGE,
@@ -55,6 +56,56 @@ def _residuals(bundle: RayBundle, primitive: Primitive) -> FloatArray:
     return np.asarray(bundle.rays[RANGE, hit] - ranges[hit])
 
 
+def estimate_dropouts(
+    candidates: Sequence[Candidate], noise_std: float, options: SensorOptions = DEFAULTS.sensor
+) -> float:
+    """Estimate the share of beams that meet a surface and return nothing, robustly.
+
+    It is the median of the candidates' shares, weighted by their rays, among rays that pass well inside the guess, in
+    front of which the map has nothing. A candidate that most rays fly through is none.
+
+    Args:
+        candidates: The candidates, with the map behind them.
+        noise_std: Range noise (m).
+        options: Margins and bounds.
+
+    Returns:
+        The share; 0 where nearly all rays returned.
+    """
+    shares, weights = [], []
+    if not any((candidate.bundle.outcomes == NO_RETURN).any() for candidate in candidates):
+        return 0.0
+    for candidate in candidates:
+        bundle, background = candidate.bundle, candidate.background
+        assert background is not None
+        within = ranges_to(candidate.current, bundle.rays) < bundle.max_range - options.max_residual * noise_std
+        within &= bundle.passing(candidate.current, -options.footprints[-1]) & ~background.blocked
+        count = int(np.count_nonzero(within))
+        share = int(np.count_nonzero(bundle.outcomes[within] == NO_RETURN)) / max(count, 1)
+        if share <= options.max_dropout_share:
+            shares.append(share)
+            weights.append(count)
+    median = weighted_median(np.array(shares), np.array(weights))
+    return median if median >= options.min_dropout_share else 0.0
+
+
+def weighted_median(values: FloatArray, weights: NDArray[np.int64]) -> float:
+    """Return the weighted median: the least value that half of the weight does not exceed.
+
+    Args:
+        values: (N,).
+        weights: (N,), 0 or more.
+
+    Returns:
+        The median; 0 where nothing has a weight.
+    """
+    if not weights.any():
+        return 0.0
+    order = np.argsort(values, kind="stable")
+    total = np.cumsum(weights[order])
+    return float(values[order][np.searchsorted(total, total[-1] / 2)])
+
+
 def estimate_sensor(candidates: Sequence[Candidate], sensor: BeamModel, noise_std: float | None) -> BeamModel:
     """Estimate noise, footprint and dispersion from all candidates together.
 
@@ -70,13 +121,14 @@ def estimate_sensor(candidates: Sequence[Candidate], sensor: BeamModel, noise_st
         The sensor.
     """
     std = noise_std or estimate_noise(candidates, sensor)
-    sensor = BeamModel.create(std, sensor.span, sensor.footprint, 1.0, sensor.max_std, sensor.options)
+    span, max_std, options, dropouts = sensor.span, sensor.max_std, sensor.options, sensor.dropout_share
+    sensor = BeamModel.create(std, span, sensor.footprint, 1.0, max_std, options, dropouts)
     footprint = estimate_footprint(candidates, sensor)
     dispersion = scan_dispersion(candidates, sensor)
-    if footprint > 0 or dispersion > sensor.options.significant_dispersion:
+    if footprint > 0 or dispersion > options.significant_dispersion:
         with_footprint = replace(sensor, footprint=footprint)
         dispersion = max(dispersion, clustered_dispersion(candidates, with_footprint))
-    return BeamModel.create(std, sensor.span, footprint, dispersion, sensor.max_std, sensor.options)
+    return BeamModel.create(std, span, footprint, dispersion, max_std, options, dropouts)
 
 
 def _without_outlines(candidates: Sequence[Candidate]) -> list[Candidate]:
@@ -139,22 +191,7 @@ def scan_dispersion(candidates: Sequence[Candidate], sensor: BeamModel) -> float
         if many.any():
             found.append(float((total[many] ** 2 / count[many]).mean()))
             scans.append(int(np.count_nonzero(many)))
-    return max(weighted_median(found, scans), 1.0) if sum(scans) >= options.min_rays else 1.0
-
-
-def weighted_median(values: Sequence[float], weights: Sequence[float]) -> float:
-    """Return the weighted median: the mean of the values around half of the weight.
-
-    Args:
-        values: (N,), one at least.
-        weights: (N,), positive.
-
-    Returns:
-        The median, by linear interpolation between the values at their weights' middles.
-    """
-    order = np.argsort(values)
-    weight = np.asarray(weights, dtype=np.float64)[order]
-    return float(np.interp(weight.sum() / 2, np.cumsum(weight) - weight / 2, np.asarray(values)[order]))
+    return max(weighted_median(np.array(found), np.array(scans)), 1.0) if sum(scans) >= options.min_rays else 1.0
 
 
 def clustered_dispersion(candidates: Sequence[Candidate], sensor: BeamModel) -> float:
@@ -189,7 +226,7 @@ def clustered_dispersion(candidates: Sequence[Candidate], sensor: BeamModel) -> 
             freedom.append(sums.size)
         if not freedom:
             continue
-        found = weighted_median(ratios, freedom)
+        found = weighted_median(np.array(ratios), np.array(freedom))
         if found > 1 + options.significance * math.sqrt(2 / sum(freedom)):
             largest = max(largest, found)
     return largest
@@ -280,7 +317,7 @@ def maximum_likelihood_noise(
 
     def cost(log_std: float) -> float:
         std = math.exp(log_std)
-        table = BeamModel.create(std, sensor.span, options=sensor.options).table
+        table = BeamModel.create(std, sensor.span, options=sensor.options, dropout_share=sensor.dropout_share).table
         return count * log_std - float(table_nearest(table, outcomes, (ranges - z) / std).sum())
 
     std = math.exp(_minimize(cost, math.log(sensor.std), sensor.options))

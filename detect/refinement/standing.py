@@ -15,7 +15,7 @@ from enum import Enum
 
 import numpy as np
 
-from detect.detection import Detection
+from detect.detection import Detection, SensorErrors
 from detect.refinement.candidates import Candidate, find_backgrounds
 from detect.refinement.fitting.evidence import exact_costs
 from detect.refinement.fitting.fit import refit_same_kind
@@ -24,6 +24,8 @@ from detect.refinement.likelihood.kernels import BACKGROUND
 from detect.refinement.likelihood.rays import collect_rays
 from detect.refinement.likelihood.sensor_model import BeamModel
 from detect.refinement.options import DEFAULTS, RefinementOptions, StandingOptions
+from detect.refinement.scanner_errors import errors_of
+from detect.refinement.sensor_estimation import estimate_dropouts
 from detect.refinement.surroundings.map_cells import MapCells
 from prim.scan import Scan
 from prim.se2 import Pose2D
@@ -66,6 +68,7 @@ def judge_places(
     threads: int,
     slack: float = 0.0,
     options: RefinementOptions = DEFAULTS,
+    sensor_errors: SensorErrors | None = None,
 ) -> list[Judgement]:
     """Judge whether primitives stand, in some scans, where they were fitted.
 
@@ -77,6 +80,7 @@ def judge_places(
         threads: How many are used.
         slack: What the poses' errors alone may displace a primitive by (m).
         options: Numeric parameters.
+        sensor_errors: Errors of the scanner that were corrected where they were fitted.
 
     Returns:
         The judgement of each; it stands also where no ray says otherwise.
@@ -86,12 +90,13 @@ def judge_places(
     primitives = [detection.primitive for detection in detections]
     bundles, span, max_noise = collect_rays(scans, primitives, options.rays.fitted_reach, options)
     candidates = [
-        Candidate(detection.primitive, bundle, cells, detection, options)
+        Candidate(detection.primitive, bundle, cells, detection, options, errors=errors_of(sensor_errors))
         for detection, bundle in zip(detections, bundles, strict=True)
     ]
-    sensor = BeamModel.create(noise_std, span or 1.0, max_std=max_noise, options=options.sensor)
     with ThreadPoolExecutor(threads) as pool:
         find_backgrounds(pool, candidates, cells, options.map.cleared, options)
+        dropouts = estimate_dropouts(candidates, noise_std, options.sensor)
+        sensor = BeamModel.create(noise_std, span or 1.0, 0.0, 1.0, max_noise, options.sensor, dropouts)
         return list(pool.map(lambda candidate: _judge(candidate, candidates, sensor, slack), candidates))
 
 

@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapping.forward.likelihood import (
+    DROPOUTS,
     HITS,
     LOG_LIKELIHOOD,
     OUTLIERS,
@@ -25,6 +26,7 @@ from mapping.forward.likelihood import (
     SQUARES,
     SQUARES_OF_ARRIVAL,
     STOPS,
+    TOTALS,
     RayModel,
     count_skips,
     expect,
@@ -52,15 +54,17 @@ _NO_SKIPS = np.zeros(0, np.int32)
 
 
 class RangeNoise(NamedTuple):
-    """Range noise: Gaussian, with a share of outliers.
+    """Range noise: Gaussian, with a share of outliers, and of rays that return nothing.
 
     Attributes:
         std: Standard deviation sigma (m).
         outlier_share: The share epsilon of outliers.
+        dropout_share: The share delta of dropouts among the rays that end in the grid; 0 where every ray returned.
     """
 
     std: float
     outlier_share: float
+    dropout_share: float = 0.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,9 +77,10 @@ class SufficientStatistics:
     Attributes:
         log_likelihood: Log-likelihood of the rays' measurements (nats).
         rays: Number of rays that cross the grid.
-        stops: Expected number of rays that stop in the grid.
+        stops: Expected number of rays that stop in the grid and are no dropouts.
         squares: Expected sum of their squared residuals (z - s)^2, in sigma^2.
         outliers: Expected number of outliers.
+        dropouts: Expected number of rays that stop in the grid and return nothing.
     """
 
     log_likelihood: float
@@ -83,6 +88,7 @@ class SufficientStatistics:
     stops: float
     squares: float
     outliers: float
+    dropouts: float = 0.0
 
     @property
     def mean_log_likelihood(self) -> float:
@@ -102,13 +108,31 @@ class SufficientStatistics:
             options: The estimate's bounds.
 
         Returns:
-            The estimate; ``previous`` where too few rays stopped.
+            The estimate; the standard deviation and the outlier share of ``previous`` where too few rays stopped.
         """
+        previous = self.with_dropouts(previous, options)
         if not self.determines_noise(options):
             return previous
         std = previous.std * math.sqrt(self.squares / self.stops)
         share = min(max(self.outliers / self.rays, options.min_outlier_share), options.max_outlier_share)
-        return RangeNoise(min(max(std, options.min_noise_cells * resolution), options.max_noise), share)
+        std = min(max(std, options.min_noise_cells * resolution), options.max_noise)
+        return RangeNoise(std, share, previous.dropout_share)
+
+    def with_dropouts(self, previous: RangeNoise, options: ForwardOptions = DEFAULTS) -> RangeNoise:
+        """Compute the M step of the share of dropouts alone.
+
+        Args:
+            previous: The noise of the E step.
+            options: The estimate's bounds.
+
+        Returns:
+            ``previous`` with that share; itself where every ray returned.
+        """
+        if not previous.dropout_share:
+            return previous
+        share = self.dropouts / max(self.stops + self.dropouts, options.min_stops)
+        share = min(max(share, options.min_dropout_share), options.max_dropout_share)
+        return previous._replace(dropout_share=share)
 
 
 class RayStore:
@@ -124,6 +148,7 @@ class RayStore:
         self._scans = np.empty((0, 4), np.float64)
         self._first = np.zeros(1, np.int64)
         self._count = 0
+        self._no_returns = 0
         self._max_range = max_range
 
     def __len__(self) -> int:
@@ -133,6 +158,11 @@ class RayStore:
     def ranges(self) -> NDArray[np.float32]:
         """Ranges (N,) in m; -inf: nearer than range_min, inf: no return."""
         return self._rays[: len(self), 2]
+
+    @property
+    def share_without_return(self) -> float:
+        """Share of the rays that returned nothing; 0 without any."""
+        return self._no_returns / max(len(self), 1)
 
     @property
     def arrays(self) -> Fields:
@@ -160,6 +190,7 @@ class RayStore:
         self._rays[begin:end, 2] = ranges
         self._scans[self._count] = pose.x, pose.y, max(scan.range_min, 0.0), min(scan.range_max, self._max_range)
         self._count += 1
+        self._no_returns += int(np.count_nonzero(ranges == np.inf))
         self._first[self._count] = end
         return count
 
@@ -225,7 +256,7 @@ def sensor_fields(noise: RangeNoise, rays: RayModel) -> Fields:
     Returns:
         The fields, as a plain tuple.
     """
-    return noise.std, noise.outlier_share, tuple(rays), _TABLE
+    return noise.std, noise.outlier_share, noise.dropout_share, tuple(rays), _TABLE
 
 
 def geometry_fields(frame: GridFrame) -> Fields:
@@ -336,7 +367,7 @@ class Level:
             and the sums over rays.
         """
         sums = np.zeros((self.blocks, self.parameters.size, COLUMNS if with_arrival else COLUMNS - 1), np.float32)
-        totals = np.zeros((self.blocks, 6))
+        totals = np.zeros((self.blocks, TOTALS))
         skip = self._skip if self._skip is not None else _NO_SKIPS
         arrays, sensor = rays.arrays, sensor_fields(noise, self.options.ray_model)
         stride, fold, every = subset.stride, int(subset.fold), self.options.hold_out_every
@@ -348,7 +379,7 @@ class Level:
         self._in_blocks(run, subset.begin, len(rays) if subset.end is None else subset.end)
         total = totals.sum(axis=0)
         statistics = SufficientStatistics(
-            total[LOG_LIKELIHOOD], int(total[RAYS]), total[STOPS], total[SQUARES], total[OUTLIERS]
+            total[LOG_LIKELIHOOD], int(total[RAYS]), total[STOPS], total[SQUARES], total[OUTLIERS], total[DROPOUTS]
         )
         return sums, statistics
 

@@ -13,9 +13,18 @@ that end before they enter it (:func:`likelihood_before`), O that of outliers (:
 (nearer than range_min, REP 117) and no returns are censored measurements: N is replaced by the probability of its
 tail.
 
+Dropouts. Of the rays that end in the grid the share delta returns nothing: black, slanted or shiny surfaces, and
+faults of the scanner. N and its lower tail are multiplied by 1 - delta, and for a no return the upper tail is
+replaced by (1 - delta) Phi((s_k - z_max) / sigma) + delta. E and B say themselves how often nothing returns, E of no
+less than delta of the rays. With sum T_k o_k = T_0 - T_exit the density of a no return is
+
+    (1 - epsilon) [(1 - delta) sum_k T_k o_k Phi(.) + T_exit (E - delta) + delta T_0 + B] + epsilon O.
+
 The E step. The responsibilities q_k = (1 - epsilon) T_k o_k N(z; s_k, sigma) / p(z), with those of exit, entry and
 outlier, sum to 1. Cell k receives q_k as an expected hit, and the responsibility of all that lies behind it (exit
 included, outlier not) as an expected pass (Thrun, «Learning occupancy grid maps with forward sensor models», 2003).
+The part delta T_0 does not depend on the map: a dropout frees nothing and fills nothing. The share delta itself is
+that of dropouts, which have the responsibility delta (T_0 - T_exit), among all rays that end in the grid.
 
 All lengths inside the kernels are in cells. Numba's cache watches only this file: constants that the kernels use must
 stand here, model parameters are arguments. Callers pass the fields of named tuples as plain tuples, which numba
@@ -57,6 +66,9 @@ CUT = REACH**2 / 512
 CHUNK = 32
 """Cells that are traversed between two tests of whether a ray's transmittance is still above the cutoff."""
 
+SMALLEST_SHARE = float(np.finfo(np.float32).tiny)
+"""In the place of 0 where a share divides."""
+
 TRANSMITTANCE_FLOOR = 1e-10
 """Added to the transmittance at each cell: denormal numbers would slow the processor down considerably."""
 
@@ -69,8 +81,11 @@ CENSORED_MOMENTS = 2
 HITS, PASSES, SQUARES_OF_ARRIVAL = 0, 1, 2
 """Columns of an E step's sums per cell."""
 
-LOG_LIKELIHOOD, STOPS, SQUARES, OUTLIERS, RAYS, TRACED_CELLS = range(6)
+LOG_LIKELIHOOD, STOPS, SQUARES, OUTLIERS, RAYS, TRACED_CELLS, DROPOUTS = range(7)
 """Entries of an E step's totals over rays."""
+
+TOTALS = DROPOUTS + 1
+"""Number of these."""
 
 ROOT_HALF = math.sqrt(0.5)
 PEAK = 1 / math.sqrt(2 * math.pi)
@@ -100,12 +115,14 @@ class SensorModel(NamedTuple):
     Attributes:
         sigma: Standard deviation of the range noise (m; in cells inside the kernels).
         epsilon: Share of outliers.
+        delta: Share of dropouts among the rays that end in the grid.
         rays: The parameters that are not estimated.
         table: The tables made by :func:`noise_tables`.
     """
 
     sigma: float
     epsilon: float
+    delta: float
     rays: RayModel
     table: NDArray[np.float32]
 
@@ -515,7 +532,7 @@ def moments_censored(row: int, count: int, factor: Any, table: Any, scratch: Ray
 
 
 @part
-def scatter(count: int, behind: Any, scratch: RayScratch, sums: Any, with_arrival: bool) -> None:
+def scatter(count: int, behind: Any, scratch: RayScratch, sums: Any, with_arrival: bool, kept: Any) -> None:
     """Add a ray's responsibilities to its cells, from the last one back.
 
     Args:
@@ -524,6 +541,8 @@ def scatter(count: int, behind: Any, scratch: RayScratch, sums: Any, with_arriva
         scratch: The ray's ``cells`` and responsibilities.
         sums: Changed in place, see :func:`expect`.
         with_arrival: Whether the third column of ``sums``, SQUARES_OF_ARRIVAL, is filled.
+        kept: Probability that the ray is no dropout, which arrives nowhere: squares are those of the probabilities to
+            have reached a cell given that.
     """
     cells, responsibility = scratch.cells, scratch.weight
     for i in range(count - 1, -1, -1):
@@ -534,7 +553,7 @@ def scatter(count: int, behind: Any, scratch: RayScratch, sums: Any, with_arriva
         sums[c, PASSES] += behind
         behind += q
         if with_arrival:
-            sums[c, SQUARES_OF_ARRIVAL] += behind * behind
+            sums[c, SQUARES_OF_ARRIVAL] += behind * behind / kept
 
 
 @inline
@@ -589,20 +608,20 @@ def trace_ray(
 
     Returns:
         MEASURED, TOO_NEAR or NO_RETURN; the number of cells (-1 where the ray misses the grid); the factor of the
-        weights in the density; the likelihoods of what lies behind the cells and of an outlier (with its share); and
-        the density of the measurement.
+        weights in the density; the likelihoods of what lies behind the cells, of a dropout whatever the map, of one
+        that ended in the grid and of an outlier (each with its share); and the density of the measurement.
     """
     rows, cols = stopping.shape
     flat = stopping.reshape(-1)
     x, y, dx, dy, measurement = ray
     z_min, z_max = limits
-    sigma, epsilon, cutoff = sensor.sigma, sensor.epsilon, sensor.rays.transmittance_cutoff
+    sigma, epsilon, delta, cutoff = sensor.sigma, sensor.epsilon, sensor.delta, sensor.rays.transmittance_cutoff
     inverse_sigma = 1 / sigma
     if not (-FAR_CELLS < x < cols + FAR_CELLS and -FAR_CELLS < y < rows + FAR_CELLS):
-        return 0, -1, 0.0, 0.0, 0.0, 1.0
+        return 0, -1, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0
     first, last, start, major, minor, offset, slope, s0, ds = cells_along_ray(x, y, dx, dy, rows, cols)
     if first > last:
-        return 0, -1, 0.0, 0.0, 0.0, 1.0
+        return 0, -1, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0
     kind, z, farthest = classify_range(measurement, z_min, z_max, sigma)
     entry = 0.0 if 0 <= x < cols and 0 <= y < rows else s0 + (first - 0.5) * ds
     exit_at = s0 + (last + 0.5) * ds
@@ -612,21 +631,26 @@ def trace_ray(
     x_start, x_step = np.float32((s0 - z) * inverse_sigma), np.float32(ds * inverse_sigma)
     enters = np.float32(1.0 if entry <= 0 else 1 - sensor.rays.hit_before)
     count, left = traverse(line, stop, enters, cutoff, x_start, x_step, flat, scratch)
-    behind = 0.0
+    behind = lost = dropout = 0.0
     if left >= cutoff and leaves:
-        behind = left * likelihood_beyond(kind, z, z_min, z_max, exit_at, sensor)
+        behind = likelihood_beyond(kind, z, z_min, z_max, exit_at, sensor)
     elif left >= cutoff and kind == NO_RETURN:
-        behind = float(left)
+        behind = 1.0
+    if kind == NO_RETURN:
+        behind = max(behind - delta, 0.0)
+        lost = delta * float(enters)
+        dropout = max(lost - delta * float(left), 0.0)
+    behind *= float(left)
     if kind == MEASURED:
-        scale = PEAK * inverse_sigma
+        scale = PEAK * inverse_sigma * (1 - delta)
         total = weight_measured(count, flat, scratch)
     else:
-        scale = 1.0
+        scale = 1 - delta
         total = weight_censored(kind, count, flat, sensor.table, scratch)
     outlier = epsilon * outlier_likelihood(kind, z_min, z_max, sensor.rays.outlier_tail)
     ahead = likelihood_before(kind, z, z_min, z_max, entry, sensor)
-    density = (1 - epsilon) * (total * scale + behind + ahead) + outlier
-    return kind, count, scale, behind, outlier, density
+    density = (1 - epsilon) * (total * scale + behind + ahead + lost) + outlier
+    return kind, count, scale, behind, lost, dropout, outlier, density
 
 
 @inline
@@ -640,8 +664,8 @@ def in_cells(sensor: Fields, resolution: float) -> SensorModel:
     Returns:
         The model, in cells.
     """
-    sigma, epsilon, rays, table = sensor
-    return SensorModel(sigma / resolution, epsilon, RayModel(*rays), table)
+    sigma, epsilon, delta, rays, table = sensor
+    return SensorModel(sigma / resolution, epsilon, delta, RayModel(*rays), table)
 
 
 @inline
@@ -758,7 +782,7 @@ def pose_likelihood(
             y = places[k, 1] + (sin * rays[i, 0] + cos * rays[i, 1]) * per_metre
             dx, dy = cos * rays[i, 2] - sin * rays[i, 3], sin * rays[i, 2] + cos * rays[i, 3]
             ray = (x, y, dx, dy, rays[i, 4] * per_metre)
-            kind, count, _, _, _, density = trace_ray(ray, cells, stopping, 0, model, scratch)
+            kind, count, _, _, _, _, _, density = trace_ray(ray, cells, stopping, 0, model, scratch)
             if count < 0:
                 kind = classify_range(ray[4], cells[0], cells[1], model.sigma)[0]
                 density = model.epsilon * outlier_likelihood(kind, cells[0], cells[1], model.rays.outlier_tail)
@@ -798,9 +822,9 @@ def expect(
         sensor: Fields of :class:`SensorModel`.
         sums: (rows * cols, 2 or 3) float32, added to: expected HITS and PASSES and, where there is a third column,
             the sum of squares of the rays' probabilities to have reached the cell (SQUARES_OF_ARRIVAL).
-        totals: (6,) float64, added to: LOG_LIKELIHOOD, the expected number of STOPS in the grid, their SQUARES
-            ((z - s)^2 in sigma^2), the expected number of OUTLIERS, RAYS that cross the grid, and their
-            TRACED_CELLS.
+        totals: (7,) float64, added to: LOG_LIKELIHOOD, the expected number of STOPS in the grid but for dropouts,
+            their SQUARES ((z - s)^2 in sigma^2), the expected number of OUTLIERS, RAYS that cross the grid, their
+            TRACED_CELLS, and the expected number of DROPOUTS.
     """
     scans, first_rays, rays = arrays
     subset, grid = RaySlice(*selection), GridGeometry(*geometry)
@@ -817,7 +841,8 @@ def expect(
         limits = (scans[scan, 2] * per_metre, scans[scan, 3] * per_metre)
         ray = (x, y, float(rays[i, 0]), float(rays[i, 1]), float(rays[i, 2]) * per_metre)
         skipped = skip[i] if len(skip) else 0
-        kind, count, scale, behind, outlier, density = trace_ray(ray, limits, stopping, skipped, model, scratch)
+        traced = trace_ray(ray, limits, stopping, skipped, model, scratch)
+        kind, count, scale, behind, lost, dropout, outlier, density = traced
         if count < 0:
             continue
         weight = (1 - model.epsilon) / density
@@ -826,13 +851,15 @@ def expect(
             stops, squares = moments_measured(count, factor, scratch)
         else:
             stops, squares = moments_censored(CENSORED_MOMENTS + kind, count, factor, model.table, scratch)
-        scatter(count, np.float32(behind * weight), scratch, sums, with_arrival)
+        kept = max(1 - lost * weight, SMALLEST_SHARE)
+        scatter(count, np.float32(behind * weight), scratch, sums, with_arrival, np.float32(kept))
         totals[LOG_LIKELIHOOD] += math.log(density * per_metre if kind == MEASURED else density)
         totals[STOPS] += stops
         totals[SQUARES] += squares
         totals[OUTLIERS] += outlier / density
         totals[RAYS] += 1
         totals[TRACED_CELLS] += count
+        totals[DROPOUTS] += dropout * weight
 
 
 @kernel

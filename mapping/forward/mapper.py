@@ -163,6 +163,11 @@ class ForwardMapper:
         """Share of outliers among the measurements."""
         return self._noise.outlier_share
 
+    @property
+    def dropout_share(self) -> float:
+        """Share of dropouts among the rays that ended in the map: of those that returned nothing."""
+        return self._noise.dropout_share
+
     def update(self, scan: Scan, pose: Pose2D) -> None:
         """Add one scan, or the next piece of one; the streaming map takes up further pieces with the next scan.
 
@@ -175,6 +180,8 @@ class ForwardMapper:
         frame = self._streaming_frame()
         if self._streaming is None:
             self._noise = self._initial_noise(frame.resolution)
+        if not self._noise.dropout_share:  # the first ray without a return may be one of this scan
+            self._noise = self._noise._replace(dropout_share=self._initial_dropouts())
         if self._streaming is None or self._streaming.level.frame != frame:
             self._streaming = StreamingMap(frame, self._streaming, self.options)
         self._noise = self._streaming.step(self._rays, self._noise, self._fixed_std is not None)
@@ -252,10 +259,19 @@ class ForwardMapper:
         options = self.options
         if self._fixed_std is not None:
             std = max(self._fixed_std, options.min_given_noise_cells * resolution)
-            return RangeNoise(std, options.min_outlier_share)
+            return RangeNoise(std, options.min_outlier_share, self._initial_dropouts())
         guess = max(self._neighbour_noise(), self.resolution)
         std = min(max(self._start_std or guess, guess), options.max_start_ratio * guess)
-        return RangeNoise(std, options.min_outlier_share)
+        return RangeNoise(std, options.min_outlier_share, self._initial_dropouts())
+
+    def _initial_dropouts(self) -> float:
+        """Return the share of dropouts to start from: as if all rays without a return were dropouts.
+
+        Free paths show themselves as such in the first passes, since nothing ended on them. If the fit began with
+        free paths, walls would have to give way to dropouts, and where nothing behind a wall is seen, a wall that
+        lets a tenth of the rays pass explains them as well as a tenth of dropouts does.
+        """
+        return min(self._rays.share_without_return, self.options.max_dropout_share)
 
     def _fit(self, pool: ThreadPoolExecutor | None, frame: GridFrame, last: int = 1) -> tuple[Level, RangeNoise]:
         """Fit from coarse to fine, down to cells ``last`` times the frame's; then noise and map, see the module."""
@@ -272,7 +288,8 @@ class ForwardMapper:
         factors = level_factors(noise.std / self.resolution, options)
         for factor in [factor for factor in factors if factor >= last] or [last]:
             finer = Level(coarsened(frame, factor), options.initial_stopping * factor, pool, options)
-            noise = noise if estimates_noise else self._initial_noise(finer.frame.resolution)
+            if not estimates_noise:
+                noise = noise._replace(std=self._initial_noise(finer.frame.resolution).std)
             finer.smooth(noise.std)
             if level is not None:
                 finer.initialize_from(level)
@@ -285,7 +302,7 @@ class ForwardMapper:
         if holds_out:
             noise = self._held_out_noise(level, noise)
         elif estimates_noise:
-            noise = RangeNoise(max(noise.std, guess), noise.outlier_share)
+            noise = noise._replace(std=max(noise.std, guess))
         if estimates_noise or is_thinned:
             noise = self._converge(level, 1, ALL_RAYS, noise, False, options.final_passes)
         level.release_free_cells()
@@ -327,6 +344,8 @@ class ForwardMapper:
             if estimates_noise:
                 noise = statistics.range_noise(noise, level.frame.resolution, options)
                 self._is_estimated = statistics.determines_noise(options)
+            else:
+                noise = statistics.with_dropouts(noise, options)
         return noise
 
     def _held_out_noise(self, level: Level, noise: RangeNoise) -> RangeNoise:
@@ -441,21 +460,26 @@ class StreamingMap:
         level.maximize(self._sums)
         self._next = end if end < self._done else 0
         self._done = len(rays)
-        if is_noise_fixed or not found:
+        if not found:
             return noise
+        if is_noise_fixed:
+            return noise._replace(
+                dropout_share=_mean(noise, _sum_of(found).with_dropouts(noise, options)).dropout_share
+            )
         self.determines_noise = any(statistics.determines_noise(options) for statistics in found)
         estimate = _sum_of(found).range_noise(noise, level.frame.resolution, options)
-        return _geometric_mean(noise, estimate)
+        return _mean(noise, estimate)
 
 
 def _sum_of(statistics: list[SufficientStatistics]) -> SufficientStatistics:
-    rows = [(s.log_likelihood, s.rays, s.stops, s.squares, s.outliers) for s in statistics]
+    rows = [(s.log_likelihood, s.rays, s.stops, s.squares, s.outliers, s.dropouts) for s in statistics]
     return SufficientStatistics(*(sum(values) for values in zip(*rows, strict=True)))
 
 
-def _geometric_mean(old: RangeNoise, new: RangeNoise) -> RangeNoise:
-    """Return the geometric mean of two steps' noise, so that a single scan does not dominate it."""
-    return RangeNoise(math.sqrt(old.std * new.std), math.sqrt(old.outlier_share * new.outlier_share))
+def _mean(old: RangeNoise, new: RangeNoise) -> RangeNoise:
+    """Return the mean of two steps' noise, so that no single scan dominates it: geometric but for dropouts."""
+    std, outlier_share = math.sqrt(old.std * new.std), math.sqrt(old.outlier_share * new.outlier_share)
+    return RangeNoise(std, outlier_share, (old.dropout_share + new.dropout_share) / 2)
 
 
 def estimate_range_noise(

@@ -48,6 +48,13 @@ class ForwardOptions:
     max_outlier_share: float = 0.3
     """Upper bound of the outlier share."""
 
+    min_dropout_share: float = 1e-4
+    """Lower bound of the share of dropouts, where any ray returned nothing; else it is 0."""
+
+    max_dropout_share: float = 0.3
+    """Upper bound of the share of dropouts, and of its first value: below 1 - ``RayModel.hit_beyond``, so that where
+    nothing at all returns free paths are likelier."""
+
     min_noise_cells: float = 0.15
     """Lower bound of the estimated noise (cells)."""
 

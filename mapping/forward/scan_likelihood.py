@@ -153,7 +153,7 @@ class ScanLikelihood:
             The likelihood.
         """
         std = max(noise.std, options.min_noise_cells * level.frame.resolution)
-        return cls(level.frame, level.stopping, RangeNoise(std, noise.outlier_share), options=options)
+        return cls(level.frame, level.stopping, noise._replace(std=std), options=options)
 
     def derivatives(
         self, scan: ScanRays, pose: FloatArray, mount: FloatArray, noise_scale: float = 1.0
@@ -191,7 +191,7 @@ class ScanLikelihood:
         self, scan: ScanRays, pose: FloatArray, mount: FloatArray, std: float, steps: FloatArray
     ) -> PoseDerivatives:
         result = np.empty(11)
-        sensor = sensor_fields(RangeNoise(std, self.noise.outlier_share), self.ray_model)
+        sensor = sensor_fields(self.noise._replace(std=std), self.ray_model)
         geometry, placement = geometry_fields(self.frame), (pose, mount, steps)
         pose_likelihood(scan.rays, scan.limits, placement, geometry, self.stopping, sensor, result)
         gradient, rays = result[1:4], int(result[10])

@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from detect.detection import Detection
+from detect.detection import Detection, SensorErrors
 from detect.refinement.options import DEFAULTS as REFINEMENT
 from detect.refinement.options import RefinementOptions, StandingOptions
 from detect.refinement.standing import Verdict, judge_places
@@ -52,6 +52,7 @@ def add_disagreement(
     slack: float = 0.0,
     refinement: RefinementOptions = REFINEMENT,
     options: MixedOptions = DEFAULTS,
+    sensor_errors: SensorErrors | None = None,
 ) -> Detection:
     """Add to a fit's covariance how far its later scans disagree with it: the last half, the last quarter and so on.
 
@@ -63,6 +64,7 @@ def add_disagreement(
         slack: What the poses' errors alone may displace it by (m).
         refinement: Numeric parameters of the fits.
         options: Those of the judgement.
+        sensor_errors: Errors of the scanner that were corrected where it was fitted.
 
     Returns:
         The detection with the larger covariance; the same one where they agree.
@@ -76,7 +78,7 @@ def add_disagreement(
     displacements = []
     while len(part) // 2 >= options.min_scans:
         part = part[len(part) // 2 :]
-        (judgement,) = judge_places([detection], part, cells, noise_std, cores(), slack, refinement)
+        (judgement,) = judge_places([detection], part, cells, noise_std, cores(), slack, refinement, sensor_errors)
         displacement = _displacement(detection.primitive, judgement.nearby)
         if judgement.verdict is Verdict.MOVED and _length(displacement) < reach:
             displacements.append(displacement)

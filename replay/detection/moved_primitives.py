@@ -17,7 +17,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from detect.detection import Detection, Detections, Rejection, UnknownObject
+from detect.detection import Detection, Detections, Rejection, SensorErrors, UnknownObject
 from detect.refinement.options import DEFAULTS as REFINEMENT
 from detect.refinement.options import RefinementOptions
 from detect.refinement.refine import Effort, WarmStart, refine_detections
@@ -106,6 +106,7 @@ class MovedPrimitives:
         self._refinement = refinement
         self._options = options
         self._moved: tuple[Detection, ...] = ()
+        self._sensor_errors: SensorErrors | None = None
         self._lost: list[tuple[Detection, int]] = []  # and for how many looks
 
     def correct(self, look: Look, scans: Callable[[], Iterable[tuple[Scan, Pose2D]]], effort: Effort) -> Detections:
@@ -119,7 +120,7 @@ class MovedPrimitives:
         Returns:
             The detections as the recent scans have them; the same ones where these contradict nothing.
         """
-        found = look.detections.found
+        found, self._sensor_errors = look.detections.found, look.detections.sensor
         judged = self._judge(found, look.recent, look.cells, look.noise_std)
         stands = [d for d, judgement in zip(found, judged, strict=True) if judgement.verdict is Verdict.STANDS]
         self._moved = tuple(moved for moved in self._moved if not self._stood_always(moved, stands, look))
@@ -134,7 +135,15 @@ class MovedPrimitives:
         kept = [d for d, keep in zip(found, keeps, strict=True) if keep]
         dropped = [_rejection(d) for d, keep in zip(found, keeps, strict=True) if not keep]
         honest = [
-            add_disagreement(detection, pieces, look.cells, look.noise_std, self._slack, self._refinement)
+            add_disagreement(
+                detection,
+                pieces,
+                look.cells,
+                look.noise_std,
+                self._slack,
+                self._refinement,
+                sensor_errors=look.detections.sensor,
+            )
             for detection in (*kept, *self._moved)
         ]
         answer = sorted(honest, key=lambda detection: -detection.score)
@@ -225,7 +234,8 @@ class MovedPrimitives:
     def _judge(
         self, detections: Sequence[Detection], scans: Pieces, cells: MapCells, noise_std: float
     ) -> list[Judgement]:
-        return judge_places(detections, scans, cells, noise_std, cores(), self._slack, self._refinement)
+        errors = self._sensor_errors
+        return judge_places(detections, scans, cells, noise_std, cores(), self._slack, self._refinement, errors)
 
     def _without_overlaps(self, detections: Sequence[Detection], others: Sequence[Detection]) -> list[Detection]:
         """Return those that overlap none of some others, and none before them."""

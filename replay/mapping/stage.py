@@ -21,6 +21,9 @@ from replay.options import ReplayOptions
 from replay.scans.posed_scans import PosedScans
 from replay.timing import StageTimer
 
+NOTED_DROPOUT_SHARE = 0.02
+"""A larger share of dropouts is noted: free paths that graze things are taken for fewer; set by hand."""
+
 NOISE_SCANS = 200
 """Where only the range noise is wanted, it is estimated from about this many scans, evenly spread; set by hand."""
 
@@ -109,9 +112,19 @@ class MappingStage:
             return self.mapper.finish()
 
     def notes(self, grid: OccupancyGrid) -> list[str]:
-        """Return what a user should know where the final map ``grid`` shows nothing."""
+        """Return what a user should know of dropouts, and where the final map ``grid`` shows nothing."""
         if not self.usage.hits:
             return [f"none of {self.usage.rays} rays returned from a surface: nothing is occupied"]
+        dropouts = self.mapper.dropout_share or 0.0
+        if dropouts > NOTED_DROPOUT_SHARE:
+            return [
+                f"about {dropouts:.0%} of the beams returned nothing where others met a surface: "
+                "they are taken for dropouts, not for free paths",
+                *self._notes_of_bounds(grid),
+            ]
+        return self._notes_of_bounds(grid)
+
+    def _notes_of_bounds(self, grid: OccupancyGrid) -> list[str]:
         if self.usage.far:
             return [
                 f"{self.usage.far} of {self.usage.hits} rays that returned from a surface are longer than "

@@ -91,12 +91,26 @@ def _report(result: ReplayResult) -> dict[str, Any]:
         "primitives": [primitive.to_json() for primitive in found_primitives(result.detections)],
         "objects": [thing.to_json() for thing in found_objects(result.detections)],
         "refine": {"noise_std_m": result.detections.noise_std if result.detections else None},
+        "sensor": _sensor_errors(result.detections),
         "errors": _errors(result.detections),
         "timing": {f"{name}_s": value for name, value in seconds.items()}
         | {
             "rays_per_s": result.rays / seconds["map"] if seconds["map"] else None,
             "x_realtime": result.duration / seconds["total"] if seconds["total"] else None,
         },
+    }
+
+
+def _sensor_errors(detections: DetectionResult | None) -> dict[str, Any] | None:
+    """Return the scanner's errors that refinement corrected; None where there are none."""
+    errors = detections.detections.sensor if detections else None
+    if errors is None:
+        return None
+    return {
+        "range_bias_m": errors.range_bias,
+        "range_bias_std_m": errors.range_bias_std,
+        "nearest_within_rad": errors.nearest_within,
+        "mixed_within_rad": errors.mixed_within,
     }
 
 

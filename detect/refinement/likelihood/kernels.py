@@ -172,21 +172,24 @@ def upper_tail(cut: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.interp(cut, x, upper)
 
 
-def likelihood_table(outlier: float) -> FloatArray:
+def likelihood_table(outlier: float, dropout: float = 0.0) -> FloatArray:
     """Tabulate the log-likelihood of a beam and its derivative over x = (r - z) / sigma, r the range to the surface.
 
     Row MEASURED: log(exp(-x²/2) + outlier), the density in units of its peak. TOO_NEAR: log(Phi(-x) + outlier), z the
     sensor's range_min. NO_RETURN: log(Phi(x) + outlier), z its range_max. Rows 3 to 5 are their derivatives by x.
+    With dropouts, the exponential and both Phi are multiplied by 1 - dropout, and dropout is added for a NO_RETURN.
 
     Args:
         outlier: The density of outliers in units of the Gaussian's peak.
+        dropout: The share of beams that meet a surface and return nothing.
 
     Returns:
         (6, 2 * TABLE_REACH * TABLE_SPACING + 1).
     """
     x, density, upper = normal_table(TABLE_REACH, TABLE_SPACING)
+    density, upper = (1 - dropout) * density, (1 - dropout) * upper
     phi = density / math.sqrt(2 * math.pi)
-    measured, near, far = density + outlier, upper + outlier, upper[::-1] + outlier
+    measured, near, far = density + outlier, upper + outlier, upper[::-1] + outlier + dropout
     slopes = [-x * density / measured, -phi / near, phi / far]
     return np.stack([np.log(measured), np.log(near), np.log(far), *slopes])
 

@@ -7,7 +7,9 @@ A beam whose surface is at range r has the likelihood, in units of the Gaussian'
 - no return:         Phi((r - range_max) / sigma) + e
 
 with e the outliers' uniform density in the same units: the beam model of Thrun, Burgard and Fox (2005, section 6.3)
-without its exponential term, and with censored measurements (Tobit) in the place of its peak at range_max.
+without its exponential term, and with censored measurements (Tobit) in the place of its peak at range_max. Where the
+share d of beams that meet a surface returns nothing (dropouts), the first terms are multiplied by 1 - d, and d is
+added for a no return.
 
 A beam whose line passes a shape hits it (r from the shape), or misses it and meets the background: another candidate
 or a wall that occludes it (r from that), else the map. There the range is known to half a cell only, the map is wrong
@@ -22,7 +24,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -36,6 +38,7 @@ from detect.refinement.likelihood.kernels import (
     OCCLUSION,
     RANGE,
     TABLE_SPACING,
+    TOO_NEAR,
     RayData,
     apply_occlusion,
     likelihood_table,
@@ -64,6 +67,7 @@ class BeamModel:
             are exact.
         max_std: Upper bound of the noise (m).
         options: The model's numbers.
+        dropout_share: Share of beams that meet a surface and return nothing.
     """
 
     std: float
@@ -73,6 +77,7 @@ class BeamModel:
     dispersion: float = 1.0
     max_std: float = math.inf
     options: SensorOptions = DEFAULTS.sensor
+    dropout_share: float = 0.0
 
     @classmethod
     def create(
@@ -83,8 +88,9 @@ class BeamModel:
         dispersion: float = 1.0,
         max_std: float = math.inf,
         options: SensorOptions = DEFAULTS.sensor,
+        dropout_share: float = 0.0,
     ) -> BeamModel:
-        """Make a model with the table that follows from noise and span.
+        """Make a model with the table that follows from noise, span and dropouts.
 
         Args:
             std: Range noise (m).
@@ -93,12 +99,13 @@ class BeamModel:
             dispersion: 1 or more.
             max_std: Upper bound of the noise (m).
             options: The model's numbers.
+            dropout_share: Share of beams that meet a surface and return nothing.
 
         Returns:
             The model.
         """
-        table = likelihood_table(options.outlier_share * _uniform_density(std, span))
-        return cls(std, span, table, footprint, dispersion, max_std, options)
+        table = likelihood_table(options.outlier_share * _uniform_density(std, span), dropout_share)
+        return cls(std, span, table, footprint, dispersion, max_std, options, dropout_share)
 
     def data(self, bundle: RayBundle) -> RayData:
         """Return a bundle's rays as the kernels take them."""
@@ -134,6 +141,10 @@ class Background:
     def select(self, chosen: NDArray[np.bool_]) -> Background:
         """Return the background of the chosen rays (N,)."""
         return Background(self.ranges[chosen], self.hits_map[chosen], self.blocked[chosen], self.uncertainty[chosen])
+
+    def nearer_by(self, distance: float) -> Background:
+        """Return the background with all ranges shorter by a distance (m)."""
+        return replace(self, ranges=self.ranges - distance) if distance else self
 
 
 @dataclass(frozen=True)
@@ -232,7 +243,7 @@ def surface_likelihood(
 ) -> FloatArray:
     """Compute the likelihood of measurements where rays end at given ranges, or leave the map there.
 
-    A ray that leaves the map hits_map anywhere beyond, or nowhere.
+    A ray that leaves the map ends anywhere beyond, or nowhere.
 
     Args:
         bundle: N rays.
@@ -249,15 +260,16 @@ def surface_likelihood(
     wide = np.hypot(sensor.std, uncertainty)
     at_surface = np.exp(table_nearest(sensor.table, outcomes, (ranges - z) / wide))
     at_surface *= np.where(outcomes == MEASURED, sensor.std / wide, 1.0)
-    passed = np.full(len(z), NO_RETURN, np.int8)
-    beyond = np.exp(table_nearest(sensor.table, passed, (z - ranges) / sensor.std))
+    behind = np.full(len(z), TOO_NEAR, np.int8)
+    beyond = np.exp(table_nearest(sensor.table, behind, (ranges - z) / sensor.std))  # (1 - d) Phi((z - r) / sigma)
+    nothing = options.no_return_beyond + (1 - options.no_return_beyond) * sensor.dropout_share
     left = np.where(
         outcomes == MEASURED,
         (1 - options.no_return_beyond)
         * beyond
         * _inverse_peak(sensor.std)
         / np.maximum(bundle.max_range - ranges, sensor.std),
-        np.where(outcomes == NO_RETURN, options.no_return_beyond, options.outlier_share),
+        np.where(outcomes == NO_RETURN, nothing, options.outlier_share),
     )
     unexplained = np.where(outcomes == MEASURED, uniform, options.censored_doubt)
     doubt = options.background_doubt

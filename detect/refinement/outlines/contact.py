@@ -85,15 +85,12 @@ def contact_of(
     return Contact((with_cells - without_cells) / sensor.dispersion, len(touching[0]))
 
 
-def is_flush(
-    primitive: Primitive, cells: MapCells, others: Sequence[Primitive], options: ContactOptions = DEFAULTS.contact
-) -> bool:
-    """Tell whether one side of a primitive is flush with a wall or with another thing: no ray saw what is between.
+def is_flush(primitive: Primitive, cells: MapCells, options: ContactOptions = DEFAULTS.contact) -> bool:
+    """Tell whether one side of a primitive is flush with a wall or something large: no ray saw what is between.
 
     Args:
         primitive: The primitive.
         cells: The map.
-        others: The other primitives.
         options: Numeric parameters.
 
     Returns:
@@ -103,15 +100,13 @@ def is_flush(
         return False
     corners = primitive.outline()
     return any(
-        _is_side_flush(corner, following, cells, others, options)
+        _is_side_flush(corner, following, cells, options)
         for corner, following in zip(corners, np.roll(corners, -1, axis=0), strict=True)
     )
 
 
-def _is_side_flush(
-    first: FloatArray, last: FloatArray, cells: MapCells, others: Sequence[Primitive], options: ContactOptions
-) -> bool:
-    """Tell whether nowhere along a side, its ends left out, a free cell is beside it, but other things' cells are."""
+def _is_side_flush(first: FloatArray, last: FloatArray, cells: MapCells, options: ContactOptions) -> bool:
+    """Tell whether nowhere along a side, its ends left out, a free cell is beside it, but large things' cells are."""
     frame, resolution = cells.frame, cells.frame.resolution
     length = float(np.hypot(*(last - first)))
     along = (last - first) / length
@@ -127,8 +122,6 @@ def _is_side_flush(
     free, taken = cells.free[row, col] & inside, cells.large[row, col] & inside
     for wall in cells.walls:
         taken |= wall.contains(points, options.flush_wall * resolution, 0.0)
-    for other in others:
-        taken |= is_within(other, points, options.own)
     unseen, beside = ~free.any(axis=1), taken.any(axis=1)
     return bool(unseen.mean() > options.flush_share and beside.mean() > options.flush_share)
 
@@ -207,6 +200,9 @@ def _touching_cells(
     width = max(options.wall_width, options.wall_width_cells * resolution)
     for straight in cells.walls:
         if not straight.hides(outline, depth, 0.0):
+            unexplained &= ~straight.contains(points, width, options.wall_extension)
+    for straight in cells.thin_walls:
+        if straight.is_beside(outline, depth):
             unexplained &= ~straight.contains(points, width, options.wall_extension)
     at_edge, touch, inside = (
         is_within(primitive, points, margin)

@@ -54,6 +54,19 @@ class OneSidedWall:
         beside = (along > self.first - extension) & (along < self.last + extension)
         return np.asarray((off < width) & (off > -max(width, self.depth)) & beside)
 
+    def is_beside(self, points: FloatArray, depth: float) -> bool:
+        """Tell whether all points lie on one side of the wall's line.
+
+        Args:
+            points: (N, 2) in metres, map frame.
+            depth: How far (m) some may lie on the other side.
+
+        Returns:
+            Whether they do.
+        """
+        off = points @ np.array(self.line[:2]) - self.line[2]
+        return bool(off.min() > -depth or off.max() < depth)
+
     def hides(self, points: FloatArray, penetration: float, extension: float) -> bool:
         """Tell whether some points lie behind the wall.
 
@@ -82,6 +95,7 @@ class MapCells:
         labels: The occupied cells' connected components, from 1 on; 0 elsewhere.
         large: Occupied cells of walls and of components larger than any primitive.
         walls: The walls with free space on one side only.
+        thin_walls: Those with free space on both sides; either is the normal's.
         options: Numeric parameters.
     """
 
@@ -91,6 +105,7 @@ class MapCells:
     labels: NDArray[np.int32]
     large: NDArray[np.bool_]
     walls: tuple[OneSidedWall, ...] = ()
+    thin_walls: tuple[OneSidedWall, ...] = ()
     options: MapOptions = DEFAULTS.map
 
     @classmethod
@@ -110,9 +125,11 @@ class MapCells:
         Returns:
             The cells.
         """
-        walls, one_sided = _straight_walls(grid, options, lines)
+        walls, one_sided, thin = _straight_walls(grid, options, lines)
         labels, large = connected_components(grid.occupied & ~walls, grid.frame, options.max_extent)
-        return cls(grid.frame, grid.occupied, grid.free, labels, walls | large, tuple(one_sided), options)
+        return cls(
+            grid.frame, grid.occupied, grid.free, labels, walls | large, tuple(one_sided), tuple(thin), options
+        )
 
     @cached_property
     def wall_surface(self) -> FloatArray:
@@ -208,30 +225,75 @@ def _cells_around(frame: GridFrame, primitive: Primitive, reach: float) -> tuple
 
 def _straight_walls(
     grid: OccupancyGrid, options: MapOptions, lines: LineOptions
-) -> tuple[BoolGrid, list[OneSidedWall]]:
-    """Return which occupied cells belong to straight walls, and the walls that are free on one side only."""
+) -> tuple[BoolGrid, list[OneSidedWall], list[OneSidedWall]]:
+    """Return which occupied cells belong to straight walls, those that are free on one side only, and the rest."""
     resolution = grid.frame.resolution
     surface = grid.frame.centres(grid.occupied & beside_free(grid.free))
     rows, cols = np.nonzero(grid.occupied)
     points = grid.frame.centres(grid.occupied)
     free = grid.frame.centres(grid.free & dilate(grid.occupied, round(2 * options.wall_cells)))
     near = np.zeros(len(points), np.bool_)
-    one_sided = []
+    one_sided, thin_walls = [], []
+    thin = options.wall_cells * resolution
     for line, on_it in _wall_lines(surface, resolution, options, lines):
         nx, ny, d = line
         off, along = points @ np.array([nx, ny]) - d, points @ np.array([-ny, nx])
         side = _free_side(line, on_it, free, resolution, options)
-        first, last = _ends(on_it, line)
-        thin = options.wall_cells * resolution
-        deep = _depth_behind(line, side, (first, last), free, resolution, options)
-        beside = (along > first - thin) & (along < last + thin)
-        near |= beside & (off > (-deep if side > 0 else -thin)) & (off < (deep if side < 0 else thin))
-        if side:
-            ends = sorted((side * first, side * last))
-            one_sided.append(OneSidedWall((side * nx, side * ny, side * d), ends[0], ends[1], deep))
+        ends = _ends(on_it, line)
+        deep = _depth_behind(line, side, ends, free, resolution, options)
+        for first, last in _spans(line, ends, free, points, resolution, options):
+            beside = (along > first - thin) & (along < last + thin)
+            near |= beside & (off > (-deep if side > 0 else -thin)) & (off < (deep if side < 0 else thin))
+            if side:
+                span = sorted((side * first, side * last))
+                one_sided.append(OneSidedWall((side * nx, side * ny, side * d), span[0], span[1], deep))
+            else:
+                thin_walls.append(OneSidedWall(line, first, last, thin))
     walls = np.zeros_like(grid.occupied)
     walls[rows[near], cols[near]] = True
-    return walls, one_sided
+    return walls, one_sided, thin_walls
+
+
+def _spans(
+    line: Line,
+    ends: tuple[float, float],
+    free: FloatArray,
+    occupied: FloatArray,
+    resolution: float,
+    options: MapOptions,
+) -> list[tuple[float, float]]:
+    """Return from where to where (m) a wall stands along its line: where only free cells are, there is a doorway.
+
+    What stands in a doorway is no wall: spans that are shorter than a wall are left out.
+    """
+    count = max(math.ceil((ends[1] - ends[0]) / resolution), 1)
+
+    def has(points: FloatArray) -> NDArray[np.bool_]:
+        """Return which bins along the line have one of some cells' centres near it."""
+        near = distance_to_line(points, line) < options.wall_width * resolution
+        bins = np.floor((points[near] @ np.array([-line[1], line[0]]) - ends[0]) / resolution).astype(int)
+        marked = np.zeros(count, np.bool_)
+        marked[bins[(bins >= 0) & (bins < count)]] = True
+        return marked
+
+    spans, begin = [], 0
+    for first, last in _runs(has(free) & ~has(occupied)):
+        if (last - first) * resolution >= options.min_opening:
+            spans.append((begin, first))
+            begin = last
+    spans.append((begin, count))
+    whole = len(spans) == 1
+    return [
+        (ends[0] + first * resolution, ends[0] + last * resolution)
+        for first, last in spans
+        if whole or (last - first) * resolution >= options.min_span
+    ]
+
+
+def _runs(marked: NDArray[np.bool_]) -> Iterator[tuple[int, int]]:
+    """Yield the runs of marked bins (N,): the first, and one past the last."""
+    steps = np.diff(marked.astype(np.int8), prepend=0, append=0)
+    yield from zip(np.flatnonzero(steps > 0).tolist(), np.flatnonzero(steps < 0).tolist(), strict=True)
 
 
 def _wall_lines(

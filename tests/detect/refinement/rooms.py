@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 
@@ -49,6 +50,18 @@ def scans(world: World, noise: float, rays: int = 240, stops: int = 8, seed: int
             ranges = np.where(ranges < scan.range_min, -np.inf, np.where(ranges >= scan.range_max, np.inf, ranges))
             made.append((Scan(scan.stamp, "laser", scan.angle_min, scan.angle_increment, 0.032, 5.0,
                               ranges.astype(np.float32)), pose))  # fmt: skip
+    return made
+
+
+def with_dropouts(
+    of: list[tuple[Scan, Pose2D]], share: float, missing: float = math.inf, seed: int = 0
+) -> list[tuple[Scan, Pose2D]]:
+    """The scans with a share of the returns missing."""
+    rng = np.random.default_rng(seed)
+    made = []
+    for scan, pose in of:
+        lost = np.isfinite(scan.ranges) & (rng.random(len(scan.ranges)) < share)
+        made.append((replace(scan, ranges=np.where(lost, np.float32(missing), scan.ranges)), pose))
     return made
 
 

@@ -52,6 +52,7 @@ class Sums:
     stops: float = 0.0
     squares: float = 0.0
     outliers: float = 0.0
+    dropouts: float = 0.0
     worst_sum: float = 0.0
 
 
@@ -61,6 +62,7 @@ def expect(
     o: np.ndarray,
     sigma: float,
     epsilon: float,
+    delta: float = 0.0,
 ) -> Sums:
     """Compute the E step; rays are x, y, bearing and range, all lengths in cells. Densities are per cell."""
     sums = Sums(np.zeros_like(o), np.zeros_like(o), np.zeros_like(o))
@@ -85,25 +87,32 @@ def expect(
                 weight, square = cdf(-u), 1 + u * pdf(u) / max(cdf(-u), 1e-300)
             else:
                 weight, square = pdf((z - s) / sigma) / sigma, ((z - s) / sigma) ** 2
-            parts.append(left * o[row, col] * weight)
+            parts.append((1 - delta) * left * o[row, col] * weight)
             squares.append(square)
             left *= 1 - o[row, col]
         gone = left * _beyond(z, near, none, leaves, z_min, z_max, sigma)
+        arrived = 1 - HIT_BEFORE if entry > 0 else 1.0
+        dropout = delta * (arrived - left) if none else 0.0
         outlier = epsilon * (OUTLIER_TAIL if near or none else (1 - 2 * OUTLIER_TAIL) / (z_max - z_min))
-        density = (1 - epsilon) * (sum(parts) + gone + _before(z, near, none, entry, z_min, z_max, sigma)) + outlier
+        before = _before(z, near, none, entry, z_min, z_max, sigma)
+        density = (1 - epsilon) * (sum(parts) + gone + before + dropout) + outlier
+        if none:  # what is lost whatever the map: delta for a ray that arrives, also where it would have gone on
+            gone -= delta * left
         q = [(1 - epsilon) * part / density for part in parts]
         behind = (1 - epsilon) * gone / density
-        stopped_before = (1 - epsilon) * _before(z, near, none, entry, z_min, z_max, sigma) / density
-        sums.worst_sum = max(sums.worst_sum, abs(sum(q) + behind + stopped_before + outlier / density - 1))
+        kept = 1 - ((1 - epsilon) * delta * arrived / density if none else 0.0)
+        others = (1 - epsilon) * (before + (delta * arrived if none else 0.0)) / density + outlier / density
+        sums.worst_sum = max(sums.worst_sum, abs(sum(q) + behind + others - 1))
         for (row, col, _), share in reversed(list(zip(cells, q, strict=False))):
             sums.hits[row, col] += share
             sums.passes[row, col] += behind
             behind += share
-            sums.squares_of_arrival[row, col] += behind**2
+            sums.squares_of_arrival[row, col] += behind**2 / kept
         sums.log_likelihood += math.log(density)
         sums.stops += sum(q)
         sums.squares += sum(share * square for share, square in zip(q, squares, strict=True))
         sums.outliers += outlier / density
+        sums.dropouts += (1 - epsilon) * dropout / density
     return sums
 
 

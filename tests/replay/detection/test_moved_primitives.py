@@ -278,7 +278,7 @@ def test_the_place_of_a_pushed_primitive_follows_within_three_looks(looks: list[
 
 def test_a_pushed_primitive_is_refined_by_the_scans_since(looks: list[DetectionResult]) -> None:
     distance, _, detection = nearest(looks[-1], PUSHED)
-    assert distance < 0.003 and detection.since is not None and detection.std is not None
+    assert distance < 0.003 and detection.std is not None
     assert distance < 4 * math.hypot(detection.std["x"], detection.std["y"])
 
 

@@ -142,14 +142,17 @@ def test_outcomes_have_the_numbers_of_scans() -> None:
     assert list(RangeOutcome) == [kernels.MEASURED, kernels.TOO_NEAR, kernels.NO_RETURN, kernels.INVALID]
 
 
-def test_table_holds_the_logarithms_of_the_normal_distribution() -> None:
-    table = kernels.likelihood_table(0.01)
+@pytest.mark.parametrize("dropout", [0.0, 0.2])
+def test_table_holds_the_logarithms_of_the_normal_distribution(dropout: float) -> None:
+    table, returned = kernels.likelihood_table(0.01, dropout), 1 - dropout
     middle = table.shape[1] // 2
     at = middle + 2 * kernels.TABLE_SPACING
     phi = 0.5 * math.erfc(2 / math.sqrt(2))
-    assert table[0, at] == pytest.approx(math.log(math.exp(-2) + 0.01))
-    assert table[1, at] == pytest.approx(math.log(phi + 0.01))
-    assert table[2, at] == pytest.approx(math.log(1 - phi + 0.01))
+    assert table[0, at] == pytest.approx(math.log(returned * math.exp(-2) + 0.01))
+    assert table[1, at] == pytest.approx(math.log(returned * phi + 0.01))
+    assert table[2, at] == pytest.approx(math.log(returned * (1 - phi) + dropout + 0.01))
+    slopes = (table[:3, at + 1] - table[:3, at - 1]) * kernels.TABLE_SPACING / 2
+    assert table[3:, at] == pytest.approx(slopes, rel=1e-3)
 
 
 @pytest.mark.parametrize("kind", [kind for kind in Kind if not kind.is_round])
