@@ -512,6 +512,44 @@ class PolygonOptions:
 
 
 @dataclass(frozen=True)
+class TemplateOptions:
+    """Shapes of few parameters that are none of the kinds."""
+
+    rays: tuple[int, int, int] = (700, 2000, 8000)
+    """Rays of the three stages, about."""
+    screen: float = 60.0
+    """nats; starts that are less likely than the kind by more are left out."""
+    first: Descent = Descent((0.012,), 3, 1.0)
+    """First stage: from starts."""
+    first_screen: float = 30.0
+    """nats; of the rest those that are then less likely than the kind by more,"""
+    kept: int = 8
+    """and all but so many."""
+    coarse: Descent = Descent((0.012,), 6, 0.2)
+    """Second stage."""
+    margin: float = 6.0
+    """nats; templates whose predicted evidence is less than the kind's by more are left out."""
+    fitted: int = 4
+    """Templates that are fitted to all rays at most, those of the largest predicted evidence."""
+    fine: Descent = Descent((0.012, 0.006, 0.003, 0.001), 12, 0.05)
+    """Third stage."""
+    least_blur: float = 0.0005
+    """m; of silhouettes."""
+    information_blur: float = 0.001
+    """m; as FitOptions.information_blur."""
+    min_size: float = 0.02
+    """m; as FitOptions.min_size."""
+    max_log_odds: float = 6.0
+    """nats; bound of the logarithm of a share's odds: 0.25 % is as good as nothing, 99.75 % as good as all."""
+    first_damping: float = 1e-2
+    """As those of FitOptions."""
+    min_damping: float = 1e-6
+    max_damping: float = 1e4
+    damping_after_success: float = 0.2
+    damping_after_failure: float = 8.0
+
+
+@dataclass(frozen=True)
 class ContactOptions:
     """When a candidate is a part of something larger."""
 
@@ -576,6 +614,11 @@ class OtherOptions:
     polygon_handicap: float = 5.0
     """nats; by which polygons are less likely a priori than deformed primitives: their number of vertices is chosen
     by the same rays."""
+    template_handicap: float = 1.0
+    """nats; by which templates are less likely a priori than deformed primitives: single shapes of them look like
+    kinds."""
+    overwhelming: float = 20.0
+    """nats; where another alternative is likelier than the kinds by more, no templates are fitted."""
     flush: float = 1.0
     """Odds that a thing with a side flush with a wall, or with another thing, is a part of it: a free-standing one
     seldom stands so exactly, parts always do, and the rays cannot tell them apart."""
@@ -660,6 +703,7 @@ class RefinementOptions:
     acceptance: AcceptanceOptions = field(default_factory=AcceptanceOptions)
     outline: OutlineOptions = field(default_factory=OutlineOptions)
     polygon: PolygonOptions = field(default_factory=PolygonOptions)
+    templates: TemplateOptions = field(default_factory=TemplateOptions)
     contact: ContactOptions = field(default_factory=ContactOptions)
     other: OtherOptions = field(default_factory=OtherOptions)
     touching: TouchingOptions = field(default_factory=TouchingOptions)

@@ -1,7 +1,8 @@
 """None of the kinds: what else may explain a candidate's rays, and how likely that is.
 
-Three hypotheses compete with the kinds for the same rays: a deformed primitive and a free polygon
-(detect.refinement.outlines), which are shapes of their own, and a part of something larger, which goes on in the map.
+Four hypotheses compete with the kinds for the same rays: a deformed primitive, a free polygon and templates of few
+parameters (detect.refinement.outlines), which are shapes of their own, and a part of something larger, which goes on
+in the map.
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ import shapely
 
 from detect.refinement.candidates import Candidate
 from detect.refinement.fitting.evidence import laplace_evidence
-from detect.refinement.fitting.fit import KindFit
+from detect.refinement.fitting.fit import KindFit, refit
 from detect.refinement.likelihood.geometry import primitive_of
 from detect.refinement.likelihood.rays import RayBundle
 from detect.refinement.likelihood.sensor_model import BeamModel
@@ -24,6 +25,7 @@ from detect.refinement.outlines.contact import contact_of, is_flush
 from detect.refinement.outlines.flush import are_flush
 from detect.refinement.outlines.free_outline import OutlineCost, StarOutline, fit_free_outline, score_test
 from detect.refinement.outlines.polygons import contour_of, fit_polygons, polygon_starts
+from detect.refinement.outlines.templates import fit_templates
 from prim.arrays import FloatArray
 from prim.metrics import outline_iou
 from prim.shapes import Kind, Primitive
@@ -63,15 +65,22 @@ def free_alternatives(
     Returns:
         Those that differ from the likeliest kind's outline.
     """
-    rated = [(laplace_evidence(fit, sensor.dispersion, candidate.options.evidence), fit) for fit in candidate.fits]
-    evidence, best = max(rated, key=lambda item: item[0])
-    found = [
-        _deformed(candidate, best, bundle, sensor),
-        _polygon(candidate, evidence, bundle, candidates, sensor),
-    ]
-    kind = primitive_of(best.kind, best.p)
-    limit = 1 - candidate.options.other.min_difference
-    return [one for one in found if one is not None and outline_iou(one.vertices, kind.outline()) < limit]
+    fits = refit(candidate.fits, bundle, sensor, candidate.options.fit) if candidate.is_rough else candidate.fits
+    rated = [(laplace_evidence(fit, sensor.dispersion, candidate.options.evidence), fit) for fit in fits]
+    rated.sort(key=lambda item: -item[0])
+    evidence, best = rated[0]
+    deformed = _deformed(candidate, best, bundle, sensor)
+    polygon = _polygon(candidate, evidence, bundle, candidates, sensor)
+    outline, other = primitive_of(best.kind, best.p).outline(), candidate.options.other
+    found = _different([one for one in (deformed, polygon) if one is not None], outline, other)
+    if any(one.log_odds > other.overwhelming for one in found):
+        return found
+    return found + _different(_templates(candidate, rated, bundle, sensor), outline, other)
+
+
+def _different(found: Sequence[Alternative], outline: FloatArray, options: OtherOptions) -> list[Alternative]:
+    """Return the alternatives that differ from the likeliest kind's outline (V, 2)."""
+    return [one for one in found if outline_iou(one.vertices, outline) < 1 - options.min_difference]
 
 
 def _deformed(candidate: Candidate, best: KindFit, bundle: RayBundle, sensor: BeamModel) -> Alternative | None:
@@ -104,6 +113,20 @@ def _polygon(
     log_odds = fit.log_evidence - evidence - candidate.options.other.polygon_handicap
     reason = f"a polygon of {len(fit.vertices)} vertices explains its rays better by {log_odds:.0f} nats"
     return Alternative(fit.vertices, log_odds, fit.std, reason)
+
+
+def _templates(
+    candidate: Candidate, rated: Sequence[tuple[float, KindFit]], bundle: RayBundle, sensor: BeamModel
+) -> list[Alternative]:
+    """Fit templates in the frames of the fitted kinds, which come with their evidence, likeliest first."""
+    options, evidence = candidate.options, rated[0][0]
+    primitives = [primitive_of(fit.kind, fit.p) for _, fit in rated]
+    found = []
+    for fit in fit_templates(primitives, evidence, bundle, sensor, options.evidence.max_extent, options.templates):
+        log_odds = fit.log_evidence - evidence - options.other.template_handicap
+        reason = f"{fit.name} explains its rays better by {log_odds:.0f} nats"
+        found.append(Alternative(fit.vertices, log_odds, fit.std, reason))
+    return found
 
 
 def larger_alternatives(

@@ -8,5 +8,6 @@ __all__, __getattr__, __dir__ = lazy_exports(
         "contact_of": "detect.refinement.outlines.contact",
         "fit_free_outline": "detect.refinement.outlines.free_outline",
         "fit_polygons": "detect.refinement.outlines.polygons",
+        "fit_templates": "detect.refinement.outlines.templates",
     },
 )

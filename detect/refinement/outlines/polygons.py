@@ -192,11 +192,19 @@ def _evaluated(vertices: FloatArray, data: RayData, scale: float, blur: float, o
         return PolygonFit(vertices, -math.inf, math.inf)
     volume = count * math.log(2 * math.pi) - 0.5 * logarithm
     prior = -(count - 1) * math.log(2 * math.pi * variance) - count * math.log(options.vertex_odds)
-    return PolygonFit(vertices, float(-cost + volume + prior), _std_across(vertices, covariance))
+    return PolygonFit(vertices, float(-cost + volume + prior), std_across(vertices, covariance))
 
 
-def _std_across(vertices: FloatArray, covariance: FloatArray) -> float:
-    """Return the median standard deviation (m) of the vertices across the outline."""
+def std_across(vertices: FloatArray, covariance: FloatArray) -> float:
+    """Return how unsure an outline is.
+
+    Args:
+        vertices: (V, 2) in m.
+        covariance: (2 V, 2 V) of their coordinates.
+
+    Returns:
+        The median standard deviation (m) of the vertices across the outline.
+    """
     along = np.roll(vertices, -1, axis=0) - np.roll(vertices, 1, axis=0)
     length = np.hypot(*along.T)
     across = np.column_stack((along[:, 1], -along[:, 0])) / np.where(length > 0, length, 1.0)[:, None]
