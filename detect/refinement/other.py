@@ -130,13 +130,14 @@ def _templates(
 
 
 def larger_alternatives(
-    candidate: Candidate, primitive: Primitive, others: Sequence[Primitive], sensor: BeamModel
+    candidate: Candidate, primitive: Primitive, std: float, others: Sequence[Primitive], sensor: BeamModel
 ) -> list[Alternative]:
     """Ask whether a candidate is a part of something larger.
 
     Args:
         candidate: The fitted candidate.
         primitive: What it is told as.
+        std: Standard deviation (m) of its place.
         others: The other primitives that are told.
         sensor: The sensor.
 
@@ -152,11 +153,11 @@ def larger_alternatives(
     if contact.cells:
         nats = contact.nats
         reason = f"a part of something larger: its rays are likelier by {nats:.0f} nats with what touches it"
-        found.append(Alternative(outline, nats - options.contact.min_nats, 0.0, reason))
+        found.append(Alternative(outline, nats - options.contact.min_nats, std, reason))
     beside_other = any(are_flush(primitive, other, options.touching) for other in others)
     if beside_other or is_flush(primitive, candidate.cells, options.contact):
         reason = "one side is flush with what is beside it: as likely a part of that"
-        found.append(Alternative(outline, math.log(options.other.flush / len(Kind)), 0.0, reason, is_told=False))
+        found.append(Alternative(outline, math.log(options.other.flush / len(Kind)), std, reason, is_told=False))
     return found
 
 

@@ -533,7 +533,8 @@ class Refinement:
         def larger(one: Candidate) -> list[Alternative]:
             others = [primitive for key, primitive in kept.items() if key != id(one)]
             others += [part.current for part in self._parts_beside(one) if id(part) not in kept]
-            return larger_alternatives(one, kept[id(one)], others, sensor)
+            std = _required(results[id(one)]).std
+            return larger_alternatives(one, kept[id(one)], max(std["x"], std["y"]), others, sensor)
 
         for one, parts in zip(rest, pool.map(larger, rest), strict=True):
             beside[id(one)] = _required(results[id(one)]).beside([*shapes[id(one)], *parts], other)
