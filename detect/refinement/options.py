@@ -606,8 +606,9 @@ class ContactOptions:
 class OtherOptions:
     """When a candidate is none of the kinds."""
 
-    prior: float = 0.5
-    """Prior probability of «none of the kinds»; the kinds share the rest evenly."""
+    prior: float = 1 / 6
+    """Prior probability of «none of the kinds», as likely as each of the five, which share the rest evenly: where few
+    rays tell nothing, it decides."""
     min_difference: float = 0.025
     """A free outline that has more than 1 minus this in common with a kind (IoU) is that kind: real things are not
     exact."""

@@ -157,7 +157,8 @@ def larger_alternatives(
     beside_other = any(are_flush(primitive, other, options.touching) for other in others)
     if beside_other or is_flush(primitive, candidate.cells, options.contact):
         reason = "one side is flush with what is beside it: as likely a part of that"
-        found.append(Alternative(outline, math.log(options.other.flush / len(Kind)), std, reason, is_told=False))
+        even = math.log(options.other.flush) - prior_log_odds(options.other)
+        found.append(Alternative(outline, even, std, reason, is_told=False))
     return found
 
 
@@ -176,10 +177,13 @@ def other_log_odds(
     """
     if not alternatives:
         return -math.inf
-    # kinds share their prior evenly: their evidence is the likeliest one's, over its probability, over their number
-    prior = math.log(options.prior / (1 - options.prior))
     together = float(np.logaddexp.reduce([one.log_odds for one in alternatives]))
-    return prior + together + math.log(max(likeliest_kind, 1 / len(Kind)) * len(Kind))
+    return prior_log_odds(options) + together + math.log(max(likeliest_kind, 1 / len(Kind)))
+
+
+def prior_log_odds(options: OtherOptions = DEFAULTS.other) -> float:
+    """Return the log prior odds of «none of the kinds» against one kind; the kinds share what is left evenly."""
+    return math.log(options.prior / (1 - options.prior)) + math.log(len(Kind))
 
 
 def simple_outline(vertices: FloatArray) -> FloatArray:

@@ -466,7 +466,8 @@ def mixed_pixels(
 
     Returns:
         The largest one (rad) up to which many of the rays that hold a silhouette in a half-width, and not in the one
-        before, are mixed; 0 where the smallest has few.
+        before, are mixed; 0 where the smallest has few, or where even the widest has many: those are errors of
+        poses, which know no width.
     """
     held, between = np.zeros(len(options.mixed)), np.zeros(len(options.mixed))
     for candidate in trusted:
@@ -478,4 +479,4 @@ def mixed_pixels(
     rings, mixed = np.diff(held, prepend=0.0), np.diff(between, prepend=0.0)
     many = (mixed >= options.min_mixed) & (mixed > options.min_mixed_share * rings)
     count = int(np.logical_and.accumulate(many).sum())
-    return float(options.mixed[count - 1]) if count else 0.0
+    return float(options.mixed[count - 1]) if 0 < count < len(many) else 0.0

@@ -290,7 +290,7 @@ def test_log_errors_keep_their_parts(tmp_path: Path) -> None:
         ({"per_kind": (3, 1)}, "per_kind 3-1 is not a range"),
         ({"kinds": ["pentagon"]}, "kinds pentagon"),
         ({"movable": True}, "movable=True does not go with motion warp"),
-        ({"world": "w.json", "walls": False}, "world excludes size, walls=False"),
+        ({"world": "w.json", "walls": False}, "world excludes walls=False"),
         ({"size": (0, 1)}, "size is 0: it must be above 0"),
         ({"motion": "fly"}, "motion fly"),
         ({"colour": "red"}, "no parameter 'colour'"),

@@ -344,7 +344,9 @@ def _posteriors_of(rounds: Sequence[Round], sensor: BeamModel, options: Evidence
 
 def _log_density(one: Round, points: FloatArray, options: EvidenceOptions) -> FloatArray:
     """Return the log density (N,) at points (N, K) of the proposal that a round was drawn from."""
-    standard = np.linalg.solve(one.lower, (one.anchor.moved(points, -1.0) - one.mean).T)
+    standard = linear_algebra.solve(one.lower, (one.anchor.moved(points, -1.0) - one.mean).T)
+    if standard is None:
+        return np.full(len(points), -math.inf)
     scale = float(np.log(np.diag(one.lower)).sum())
     return np.asarray(_log_density_of_t((standard**2).sum(axis=0), len(one.mean), options.degrees) - scale)
 
