@@ -82,7 +82,7 @@ def test_detections_are_refined_with_the_rays(noisy_session: Session, detector: 
     """The detector is 10 mm off; the rays are not, though their noise is 50 mm."""
     report = report_json(replayed(noisy_session, mapper=mapper, refine=True))
     assert json.loads(json.dumps(report)) == report
-    assert report["errors"]["f1"] > 0.6  # some of seven cannot be told from another kind, or from none, in so few rays
+    assert report["errors"]["f1"] > 0.6  # not all of seven can be told from other kinds, or from none, by so few rays
     assert report["errors"]["position_m"] < 0.004
     for one in report["primitives"]:
         assert one["stage"] == "refined" and 0 < one["score"] <= 1
