@@ -72,14 +72,18 @@ def find_sites(cells: MapCells, guesses: Sequence[Primitive], options: Refinemen
         The components, but for those that are too large.
     """
     labels = label(~cells.free & ~cells.large)
+    sizes = np.bincount(labels.ravel())
+    largest = math.pi * (options.touching.max_radius / cells.frame.resolution + 1) ** 2
     members: dict[int, list[int]] = {}
     for number, guess in enumerate(guesses):
         rows, cols, points = cells.around(guess, guess.bounding_radius)
         own = labels[rows, cols][is_within(guess, points, 0.0)]
         counts = np.bincount(own[own > 0])
-        if len(counts):
+        if len(counts) and sizes[counts.argmax()] <= largest:
             members.setdefault(int(counts.argmax()), []).append(number)
-    where = np.flatnonzero(np.isin(labels, list(members)))
+    wanted = np.zeros(len(sizes), np.bool_)
+    wanted[list(members)] = True
+    where = np.flatnonzero(wanted[labels])
     order = np.argsort(labels.flat[where], kind="stable")
     where = where[order]
     found = []
