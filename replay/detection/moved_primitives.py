@@ -43,12 +43,15 @@ class MovedOptions:
         pose_distance: … those of headings as they matter at this distance from the laser (m).
         max_shared: Of two detections that share more of the smaller one's area, one is wrong.
         looks: For so many looks the recent scans are searched for what was found, and by all scans is no more.
+        min_shift: What all scans tell to be of no kind has moved where the scans before say that it was elsewhere by
+            more than this (m), or not there: a wrong shape looks shifted by less.
     """
 
     pose_deviations: float = 4.0
     pose_distance: float = 2.0
     max_shared: float = 0.25
     looks: int = 3
+    min_shift: float = 0.03
 
 
 DEFAULTS = MovedOptions()
@@ -127,7 +130,7 @@ class MovedPrimitives:
         if not (self._has_lost(found) or self._moved) and len(stands) == len(found):
             return look.detections
         pieces = list(scans())
-        self._moved = self._refine_moved(look, judged, stands, pieces, effort)
+        self._moved = self._without_things(self._refine_moved(look, judged, stands, pieces, effort), look)
         if not self._moved:
             return look.detections
         gone = [judgement.verdict is Verdict.GONE for judgement in judged]
@@ -162,6 +165,30 @@ class MovedPrimitives:
         lost = [(known, looks + 1) for known, looks in self._lost if not self._shares(known, found)]
         self._lost = [(known, 0) for known in found] + [pair for pair in lost if pair[1] <= self._options.looks]
         return len(self._lost) > len(found)
+
+    def _without_things(self, moved: Sequence[Detection], look: Look) -> tuple[Detection, ...]:
+        """Leave out what is an object of no kind by all scans, and stood there before the recent ones too."""
+        limit, things = self._options.max_shared, look.detections.objects
+
+        def stood(detection: Detection) -> bool:
+            """Return whether the scans before it came have it there, where an object of no kind is."""
+            outline, since = detection.primitive.outline(), detection.since or look.since
+            if not any(outline_overlap(thing.outline, outline) > limit for thing in things):
+                return False
+            older = [piece for piece in look.scans if piece[0].stamp < since]
+            earliest = older[: max(len(older) // 6, 1)]  # later ones may have come after it did
+            (judgement,) = self._judge([detection], earliest, look.cells, look.noise_std)
+            is_known = judgement.is_seen or judgement.verdict is Verdict.MOVED
+            return is_known and not self._is_away(detection, judgement)
+
+        return tuple(detection for detection in moved if not stood(detection))
+
+    def _is_away(self, detection: Detection, judgement: Judgement) -> bool:
+        """Return whether scans say that something is not there, or shifted by more than a wrong shape seems to be."""
+        before, after = detection.primitive, judgement.nearby
+        shift = math.hypot(after.x - before.x, after.y - before.y)
+        is_shifted = judgement.verdict is Verdict.MOVED and shift > self._options.min_shift
+        return judgement.verdict is Verdict.GONE or is_shifted
 
     def _is_replaced(self, thing: UnknownObject) -> bool:
         """Return whether an object of no kind, by the rays of all scans, shares too much with what moved."""
