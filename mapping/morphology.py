@@ -120,6 +120,6 @@ def outer_contour(cells: BoolGrid, tolerance: float) -> NDArray[np.float64]:
     contours, _ = cv2.findContours(np.pad(doubled, 1), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
     largest = max(contours, key=cv2.contourArea)
     simple = cv2.approxPolyDP(largest, 2 * tolerance, True)[:, 0].astype(np.float64)
-    area = float(np.cross(simple, np.roll(simple, -1, axis=0)).sum()) if len(simple) > 2 else 0.0
-    ordered = simple if area >= 0 else simple[::-1]
+    (x, y), (next_x, next_y) = simple.T, np.roll(simple, -1, axis=0).T
+    ordered = simple if (x * next_y - next_x * y).sum() >= 0 else simple[::-1]
     return np.asarray((ordered - 1.0 + 0.5) / 2)

@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import shapely
+from shapely.geometry.polygon import orient
 
 from detect.detection import Detection, Detections
 from detect.refinement.options import DEFAULTS
@@ -33,7 +34,7 @@ TOUCHING = (SQUARE, DISC)
 def union_of(*primitives: Primitive) -> FloatArray:
     """The outline (V, 2) of primitives that touch, counter-clockwise."""
     together = shapely.union_all([shapely.Polygon(one.outline(48)).buffer(1e-4) for one in primitives])
-    return np.asarray(shapely.orient_polygons(together.simplify(1e-3)).exterior.coords)[:-1]
+    return np.asarray(orient(together.simplify(1e-3)).exterior.coords)[:-1]
 
 
 def refined(world: World, stops: int = 8, at: float = 0.0, closed: bool = False) -> Detections:
