@@ -1,11 +1,11 @@
-"""Evaluation in an open world: clutter, rooms, contacts, scanners with faults; how far what is told can be believed.
+"""Evaluation in an open world: clutter, rooms, contacts, scanners with faults; how reliable detections are.
 
     python -m bench.open_world [--sessions 40] [--rows clutter …] [--update docs/open_world.md]
 
 Sessions on which nothing was trained or chosen (seeds from 90000), recorded as ``prim-record`` does with the options
 that a row names, mapped by the forward mapper, detected by the shipped networks, refined. A thing that is none of
-the kinds counts where no primitive covers it with more than 0.90 (IoU; recorder.clutter.cover). It is told as a kind
-where a detection with a score above 0.5 overlaps it more than any true primitive.
+the kinds counts where no primitive covers it with more than 0.90 (IoU; recorder.clutter.cover). It is reported as a
+kind where a detection with a score above 0.5 overlaps it more than any true primitive.
 """
 
 from __future__ import annotations
@@ -78,12 +78,12 @@ USUAL_LEVELS = (0.02, 0.05)
 COVERED = 0.90
 """IoU from which on a thing counts as the primitive that covers it."""
 COVERS = (0.80, 0.85, 0.90, 0.95, 1.0)
-TOLD = 0.5
+REPORTED_SCORE = 0.5
 SCORES = (0.0, 0.5, 0.7, 0.9, 0.97, 1.0)
 
 
 @dataclass(frozen=True)
-class Told:
+class Reported:
     """A detection: its score, whether it is right, and the thing of no kind that it covers most, by index."""
 
     score: float
@@ -96,7 +96,7 @@ class Outcome:
     """The evaluation of one session.
 
     Attributes:
-        told: The detections.
+        reported: The detections.
         truths: Number of true primitives.
         covers: For each thing of no kind the IoU of a primitive that covers it best.
         sizes: Absolute errors of sizes (m) of right ones, by the index of the true primitive.
@@ -105,7 +105,7 @@ class Outcome:
         refine_s: CPU time of refinement (s).
     """
 
-    told: tuple[Told, ...]
+    reported: tuple[Reported, ...]
     truths: int
     covers: tuple[float, ...]
     sizes: tuple[float, ...]
@@ -177,7 +177,7 @@ def compare(found: Sequence[Detection], world: World, candidates: int, refine_s:
     primitives = [detection.primitive for detection in found]
     pairs = {pair.detection: pair for pair in match_primitives(primitives, world.primitives)}
     things = [np.array(solid.outline) for solid in world.clutter]
-    told, sizes, z = [], [], []
+    reported, sizes, z = [], [], []
     for k, detection in enumerate(found):
         pair = pairs.get(k)
         is_right = pair is not None and pair.found
@@ -185,7 +185,7 @@ def compare(found: Sequence[Detection], world: World, candidates: int, refine_s:
         shared = [outline_iou(outline, thing) for thing in things]
         of_truth = max((outline_iou(outline, true.outline()) for true in world.primitives), default=0.0)
         best = int(np.argmax(shared)) if shared and max(shared) > max(of_truth, 0.1) else None
-        told.append(Told(detection.score, is_right, best))
+        reported.append(Reported(detection.score, is_right, best))
         if is_right and pair is not None:
             true, kind = world.primitives[pair.truth], detection.primitive.kind
             errors = parameter_errors(detection.primitive, true)
@@ -193,10 +193,10 @@ def compare(found: Sequence[Detection], world: World, candidates: int, refine_s:
             z += [error / stds[name] for error, name in zip(errors, kind.parameters, strict=True)]
             sizes += [abs(error) for error in errors[-len(kind.sizes) :]]
     covers = tuple(cover(thing) for thing in things)
-    return Outcome(tuple(told), len(world.primitives), covers, tuple(sizes), tuple(z), candidates, refine_s)
+    return Outcome(tuple(reported), len(world.primitives), covers, tuple(sizes), tuple(z), candidates, refine_s)
 
 
-def things_told(outcomes: Sequence[Outcome], covered: float = COVERED) -> tuple[int, int]:
+def things_reported(outcomes: Sequence[Outcome], covered: float = COVERED) -> tuple[int, int]:
     """Count things of no kind that no primitive covers better than ``covered``.
 
     Args:
@@ -204,14 +204,14 @@ def things_told(outcomes: Sequence[Outcome], covered: float = COVERED) -> tuple[
         covered: IoU.
 
     Returns:
-        How many are told as a kind, and how many there are.
+        How many are reported as a kind, and how many there are.
     """
-    told = there = 0
+    reported = there = 0
     for one in outcomes:
         counting = {k for k, share in enumerate(one.covers) if share <= covered}
         there += len(counting)
-        told += len(counting & {each.thing for each in one.told if each.score > TOLD})
-    return told, there
+        reported += len(counting & {each.thing for each in one.reported if each.score > REPORTED_SCORE})
+    return reported, there
 
 
 def row(name: str, noise_std: float, outcomes: Sequence[Outcome]) -> str:
@@ -225,17 +225,19 @@ def row(name: str, noise_std: float, outcomes: Sequence[Outcome]) -> str:
     Returns:
         The row.
     """
-    told = [one for session in outcomes for one in session.told]
-    right, truths = sum(one.is_right for one in told), sum(session.truths for session in outcomes)
-    others, there = things_told(outcomes)
-    false = sum(not one.is_right and one.score > TOLD and one.thing is None for one in told) / len(outcomes)
-    sure = [one.is_right for one in told if one.score >= 0.9]
+    reported = [one for session in outcomes for one in session.reported]
+    right, truths = sum(one.is_right for one in reported), sum(session.truths for session in outcomes)
+    others, there = things_reported(outcomes)
+    false = sum(not one.is_right and one.score > REPORTED_SCORE and one.thing is None for one in reported) / len(
+        outcomes
+    )
+    sure = [one.is_right for one in reported if one.score >= 0.9]
     z = np.array([value for session in outcomes for value in session.z])
     sizes = 1000 * np.array([value for session in outcomes for value in session.sizes])
     candidates = sum(session.candidates for session in outcomes)
     cells = (
         f"{name}, {1000 * noise_std:g} mm",
-        f"{2 * right / (len(told) + truths):.3f}" if truths else "–",
+        f"{2 * right / (len(reported) + truths):.3f}" if truths else "–",
         f"{others / there:.1%} of {there}" if there else "–",
         f"{false:.2f}",
         f"{np.mean(sure):.3f} of {len(sure)}" if sure else "–",
@@ -248,14 +250,14 @@ def row(name: str, noise_std: float, outcomes: Sequence[Outcome]) -> str:
 
 
 HEAD = [
-    "| worlds, noise | F1 | things told as a kind | other false ones a session | right of those told ≥ 0.9 | "
+    "| worlds, noise | F1 | things reported as a kind | other false ones a session | right of those reported ≥ 0.9 | "
     "size, mm: mean / median | z, RMS | 95 % bars hold | CPU ms |",
     "|---|" + "---:|" * 8,
 ]
 
 
 def curves(outcomes: Sequence[Outcome]) -> list[str]:
-    """Return the reliability of scores, and the share of things told as a kind by how well a primitive covers them.
+    """Return the reliability of scores, and the share of things reported as a kind over their cover by a primitive.
 
     Args:
         outcomes: All sessions.
@@ -263,18 +265,18 @@ def curves(outcomes: Sequence[Outcome]) -> list[str]:
     Returns:
         Lines of two tables.
     """
-    told = [one for session in outcomes for one in session.told]
+    reported = [one for session in outcomes for one in session.reported]
     lines = ["", "| score | right | of |", "|---|---:|---:|"]
     for low, high in pairwise(SCORES):
-        within = [one.is_right for one in told if low <= one.score < high or (high == 1.0 and one.score == 1.0)]
+        within = [one.is_right for one in reported if low <= one.score < high or (high == 1.0 and one.score == 1.0)]
         lines.append(
             f"| {low:g} to {high:g} | {np.mean(within):.3f} | {len(within)} |"
             if within
             else f"| {low:g} to {high:g} | – | 0 |"
         )
-    lines += ["", "| covered by a primitive (IoU) up to | told as a kind | of |", "|---|---:|---:|"]
+    lines += ["", "| covered by a primitive (IoU) up to | reported as a kind | of |", "|---|---:|---:|"]
     for covered in COVERS:
-        others, there = things_told(outcomes, covered)
+        others, there = things_reported(outcomes, covered)
         lines.append(f"| {covered:g} | {others / max(there, 1):.1%} | {there} |")
     return lines
 

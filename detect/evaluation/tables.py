@@ -307,7 +307,7 @@ The columns after «refined» evaluate the primitives of a replay, refined with 
 reported primitives (correct kind, polygon IoU of at least 0.5). mAP is the field's (COCO: precision interpolated at
 101 recalls, mean over the kinds): the boxes around the outlines of the reported primitives, each with its kind and
 score. Position (the distance of the centroids), width and height are mean errors over the true positives, the
-angle's error is the median. A primitive that is told to be an object of no kind counts as not found. Rows of a
+angle's error is the median. A primitive that is reported as an object of no kind counts as not found. Rows of a
 «closed world» (`--closed-world`) do without such objects: all that stands there is taken to be one of the kinds, or a
 wall. «–»: not measured, or no true positive.
 

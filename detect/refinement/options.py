@@ -105,12 +105,11 @@ class ScannerOptions:
     """Errors that all beams of a scanner have in common, estimated from all candidates together."""
 
     deviations: float = 5.0
-    """Standard deviations from 0 at which a range bias is told: 1 in 2 million by chance, and models are never exact.
-    """
+    """Standard deviations from 0 at which a range bias is reported: 1 in 2 million by chance; models are never exact."""
     considered: float = 3.0
     """The same of the bias that the first fits show: with less nothing is fitted anew to find it."""
     min_bias: float = 0.004
-    """m; a smaller bias is not told: on real logs models are not exact to less (a scanner read 2 mm, 50 std)."""
+    """m; a smaller bias is not reported: on real logs models are not exact to less (a scanner read 2 mm, 50 std)."""
     max_bias: float = 0.05
     """m; bound of the search: real scanners state 30 mm."""
     max_step: float = 0.015
@@ -136,7 +135,7 @@ class ScannerOptions:
     turns: int = 3
     """Fits in a row, each with rays turned to the nearest surface of the fit before."""
     first_footprint: float = 0.001
-    """m; the footprint is no larger where a width is looked for. Where one is known it is 0: jumps show it best."""
+    """m; the footprint is no larger where a width is searched. Where one is known it is 0: jumps show it best."""
     reach_std: float = 0.0003
     """rad; standard deviation of a half-width, and of where mixed pixels begin: how a beam's parts make one range is
     known no better …"""
@@ -629,7 +628,7 @@ class OtherOptions:
 
 @dataclass(frozen=True)
 class TouchingOptions:
-    """When what no kind fits is told apart into two things that touch."""
+    """When what no kind fits is separated into two things that touch."""
 
     around: float = 1.5
     """cells; a component of the map belongs to a candidate where its cells are this near to it."""

@@ -40,15 +40,15 @@ class Alternative:
         log_odds: Log Bayes factor against the likeliest kind (nats).
         std: Standard deviation (m) of the outline, across it; the median over its vertices.
         reason: What it is, in words and numbers.
-        is_told: Whether a candidate that it is likelier for than the kinds is told as it; else the kind is told, with
-            the probability that is left.
+        replaces_kind: Whether a candidate is reported as this where it is likelier than the kinds; else the kind is
+            reported, with the probability that is left.
     """
 
     vertices: FloatArray
     log_odds: float
     std: float
     reason: str
-    is_told: bool = True
+    replaces_kind: bool = True
 
 
 def free_alternatives(
@@ -136,9 +136,9 @@ def larger_alternatives(
 
     Args:
         candidate: The fitted candidate.
-        primitive: What it is told as.
+        primitive: What it is reported as.
         std: Standard deviation (m) of its place.
-        others: The other primitives that are told.
+        others: The other primitives that are reported.
         sensor: The sensor.
 
     Returns:
@@ -158,7 +158,7 @@ def larger_alternatives(
     if beside_other or is_flush(primitive, candidate.cells, options.contact):
         reason = "one side is flush with what is beside it: as likely a part of that"
         even = math.log(options.other.flush) - prior_log_odds(options.other)
-        found.append(Alternative(outline, even, std, reason, is_told=False))
+        found.append(Alternative(outline, even, std, reason, replaces_kind=False))
     return found
 
 

@@ -42,7 +42,7 @@ from detect.refinement.scanner_errors import correct_scanner_errors, settle_scan
 from detect.refinement.sensor_estimation import estimate_dropouts, estimate_noise, estimate_sensor, initial_noise
 from detect.refinement.surroundings.map_cells import MapCells
 from detect.refinement.surroundings.proposals import propose
-from detect.refinement.touching import Site, Trial, find_sites, tell_apart
+from detect.refinement.touching import Site, Trial, find_sites, separate_touching
 from mapping.grid import OccupancyGrid
 from prim.arrays import FloatArray
 from prim.metrics import overlap_coefficient
@@ -88,7 +88,7 @@ class RefinedPrimitive:
     @property
     def is_other(self) -> bool:
         """Whether it is likelier none of the kinds than one of them."""
-        return self.alternative is not None and self.alternative.is_told and self.other_probability > 0.5
+        return self.alternative is not None and self.alternative.replaces_kind and self.other_probability > 0.5
 
     def beside(self, alternatives: Sequence[Alternative], options: OtherOptions) -> RefinedPrimitive:
         """Hold the kinds against alternatives.
@@ -368,7 +368,7 @@ class Refinement:
         rounds: Joint fits once duplicates are gone; None: as in the options.
         options: Numeric parameters.
         sensor: Errors of the scanner that :meth:`run` found and corrected; None where it found none.
-        further: Of things that were told apart by :meth:`run`, those beyond the guesses: with the index of the guess
+        further: Of things that were separated by :meth:`run`, those beyond the guesses: with the index of the guess
             that they were a part of.
     """
 
@@ -380,7 +380,7 @@ class Refinement:
     options: RefinementOptions = field(default_factory=RefinementOptions)
     sensor: SensorErrors | None = None
     further: list[tuple[int, RefinedPrimitive]] = field(default_factory=list)
-    _told_apart: list[Trial] = field(default_factory=list)
+    _separated: list[Trial] = field(default_factory=list)
 
     def run(
         self,
@@ -432,11 +432,11 @@ class Refinement:
     def _in_order(
         self, candidates: Sequence[Candidate], results: Mapping[int, RefinedPrimitive | None]
     ) -> list[RefinedPrimitive | None]:
-        """Return the guesses' results: of what was told apart the part most like each; ``further`` has the rest."""
+        """Return the guesses' results: of what was separated the part most like each; ``further`` has the rest."""
         numbers = {id(candidate): number for number, candidate in enumerate(candidates)}
         ordered = [results.get(id(candidate)) for candidate in candidates]
         self.further = []
-        for trial in self._told_apart:
+        for trial in self._separated:
             left = list(trial.parts)
             for guess in trial.site.candidates[: len(left)]:
                 best = max(left, key=lambda part: overlap_coefficient(part.current, guess.start))
@@ -483,7 +483,7 @@ class Refinement:
     ) -> tuple[list[Candidate], BeamModel]:
         """Estimate the sensor by the candidates that a kind fits, once its errors are taken out of all rays.
 
-        What fits no kind is told apart then, where it is two things that do.
+        What fits no kind is separated then, where it is two things that do.
         """
         noise_std = self.noise_std
         sensor = correct_scanner_errors(pool, candidates, sensor, noise_std)
@@ -494,18 +494,18 @@ class Refinement:
         if is_corrected and self.sensor is None and not self.options.closed_world:
             sensor = sensor_without_misfits(pool, candidates, sensor, noise_std)  # with all errors back
         if not self.options.closed_world:
-            candidates, sensor = self._tell_apart(pool, sites, candidates, sensor)
+            candidates, sensor = self._separate(pool, sites, candidates, sensor)
         return candidates, estimate_sensor(candidates, sensor, noise_std)
 
-    def _tell_apart(
+    def _separate(
         self, pool: Executor, sites: Sequence[Site], candidates: list[Candidate], sensor: BeamModel
     ) -> tuple[list[Candidate], BeamModel]:
         """Put two candidates where one fits no kind and two do; with them the sensor is estimated anew."""
-        self._told_apart = tell_apart(pool, sites, candidates, sensor)
-        if not self._told_apart:
+        self._separated = separate_touching(pool, sites, candidates, sensor)
+        if not self._separated:
             return candidates, sensor
-        replaced = {id(candidate) for trial in self._told_apart for candidate in trial.before}
-        parts = [part for trial in self._told_apart for part in trial.parts]
+        replaced = {id(candidate) for trial in self._separated for candidate in trial.before}
+        parts = [part for trial in self._separated for part in trial.parts]
         present = [*(candidate for candidate in candidates if id(candidate) not in replaced), *parts]
         self._fit_jointly(pool, present, sensor)
         return present, sensor_without_misfits(pool, present, sensor, self.noise_std)
@@ -541,8 +541,8 @@ class Refinement:
         return beside
 
     def _parts_beside(self, candidate: Candidate) -> list[Candidate]:
-        """Return the other parts of what a candidate was told apart from."""
-        trials = [trial for trial in self._told_apart if candidate in trial.parts]
+        """Return the other parts of what a candidate was separated from."""
+        trials = [trial for trial in self._separated if candidate in trial.parts]
         return [part for trial in trials for part in trial.parts if part is not candidate]
 
     def _near_rays(self, candidates: list[Candidate]) -> list[Candidate]:

@@ -1,6 +1,6 @@
 """Errors that all beams of a scanner have in common, estimated from all candidates together: range bias, beam width.
 
-Both make sizes wrong, and error bars too small: silhouettes say one size, ranges another. A candidate alone tells
+Both make sizes wrong, and error bars too small: silhouettes say one size, ranges another. A candidate alone shows
 little of a bias, since its place and size give way; together they do. The likelihood is profiled: at each value of an
 error all candidates are fitted anew, each by its likeliest kind. The bias is found by Gauss and Newton's method, with
 the candidates' own parameters eliminated by Schur complements; the beams' width by a search, since the likelihood

@@ -138,7 +138,7 @@ class Trial:
     parts: list[Candidate] = field(default_factory=list)
 
 
-def tell_apart(
+def separate_touching(
     pool: Executor,
     sites: Sequence[Site],
     candidates: Sequence[Candidate],

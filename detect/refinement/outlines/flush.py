@@ -1,4 +1,4 @@
-"""Primitives that touch with parallel sides: whether they are one thing, no ray tells."""
+"""Primitives that touch with parallel sides: whether they are one thing, rays cannot decide."""
 
 from __future__ import annotations
 
