@@ -105,7 +105,7 @@ class ScannerOptions:
     """Errors that all beams of a scanner have in common, estimated from all candidates together."""
 
     deviations: float = 5.0
-    """Standard deviations from 0 at which a range bias is reported: 1 in 2 million by chance; models are never exact."""
+    """Standard deviations from 0 at which a range bias is reported: 1 in 2 million by chance."""
     considered: float = 3.0
     """The same of the bias that the first fits show: with less nothing is fitted anew to find it."""
     min_bias: float = 0.004
