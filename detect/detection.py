@@ -114,6 +114,8 @@ class Detections:
         rejected: Rejected candidates in descending order of score.
         doubtful: Candidates that were rejected for their score alone, with their rejections (which are in
             ``rejected`` too): refinement decides about them.
+        rivals: Candidates that overlap a better one, which was seen in cells of another size and differs, with their
+            rejections (which are in ``rejected`` too): refinement decides between them.
         objects: What is likeliest none of the kinds, in descending order of score; refinement alone finds them.
         sensor: Errors of the scanner that refinement corrected; None where it found none.
     """
@@ -121,5 +123,6 @@ class Detections:
     found: tuple[Detection, ...]
     rejected: tuple[Rejection, ...]
     doubtful: tuple[tuple[Detection, Rejection], ...] = ()
+    rivals: tuple[tuple[Detection, Rejection], ...] = ()
     objects: tuple[UnknownObject, ...] = ()
     sensor: SensorErrors | None = None

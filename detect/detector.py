@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import islice
 from pathlib import Path
 from typing import TypeVar
@@ -13,12 +14,13 @@ from numpy.typing import NDArray
 
 from detect.detection import Detection, Detections, Rejection
 from detect.networks.cnn import ClassifiedRegion, ParameterEstimator
-from detect.networks.tiles import TILE_SIZE, clip_to_tile, tile_frames, tile_image
+from detect.networks.tiles import TILE_MARGIN, TILE_SIZE, tile_around, tile_frames, tile_image
 from detect.networks.weights import BATCHES, Weights, load_weight_set
 from detect.networks.yolo import KINDS, Boxes, Yolo, box_iou, non_maximum_suppression
 from mapping.grid import GridFrame, OccupancyGrid
-from prim.errors import UsageError
-from prim.metrics import overlap_coefficient
+from mapping.morphology import isolated_boxes
+from mapping.pyramid import DEFAULT_SIZES, SEEN_CELLS, Level, coarser, levels_for
+from prim.metrics import overlap_coefficient, polygon_iou
 from prim.world import Bounds
 
 
@@ -54,6 +56,14 @@ class DetectorOptions:
 
     max_overlap: float = 0.25
     """Largest intersection of two detections' outlines over the smaller one's area (no IoU); set by hand."""
+
+    same_iou: float = 0.8
+    """Two detections in cells of different sizes are the same where the intersection of their outlines over the union
+    is larger; set by hand."""
+
+    slack: float = 0.8
+    """What is by this factor smaller, or as much larger, than what is looked for in cells of one size counts, too: the
+    networks' sizes are not exact. Set by hand."""
 
     border: int = 2
     """Boxes this near (cells) to a tile's border, where the map goes on, are left to the next tile; set by hand."""
@@ -130,25 +140,12 @@ class Detector:
         """
         return cls(*load_weight_set(path, mapper, threads))
 
-    def detect(self, grid: OccupancyGrid) -> Detections:
-        """Detect the primitives in a map.
-
-        Raises:
-            UsageError: The map has another resolution than those that the networks were trained on.
-            WeightsError: A network does not take its images, or gives outputs that are not finite.
-        """
-        if not np.isclose(grid.frame.resolution, self.card.resolution, rtol=1e-6):
-            expected, actual = self.card.resolution, grid.frame.resolution
-            raise UsageError(f"the detector reads maps with cells of {expected:g} m, not {actual:g} m")
-        tiles = _occupied_tiles(grid)
-        return self.detect_tiles(((tile, tile_image(grid, tile, self.card.style)) for tile in tiles), grid.frame)
-
-    def detect_tiles(self, images: Iterable[tuple[GridFrame, NDArray[np.uint8]]], frame: GridFrame) -> Detections:
-        """Detect the primitives in a map that is given as images of its tiles.
+    def detect(self, grid: OccupancyGrid, sizes: tuple[float, float] = DEFAULT_SIZES) -> Detections:
+        """Detect the primitives in a map, each in cells of a size that shows it well.
 
         Args:
-            images: Frames of tiles and their images (TILE_SIZE, TILE_SIZE, 3).
-            frame: The map's frame.
+            grid: The map, with cells of any size.
+            sizes: The smallest and the largest size that is looked for (m): the longest side, or the diameter.
 
         Returns:
             Detections, rejected and doubtful candidates.
@@ -156,7 +153,56 @@ class Detector:
         Raises:
             WeightsError: A network does not take its images, or gives outputs that are not finite.
         """
-        parts = list(self._candidates(images))
+        parts, factor = [], 1
+        for level in levels_for(grid.frame.resolution, sizes):
+            grid, factor = coarser(grid, level.factor // factor), level.factor
+            parts.append(self._detect_at(grid, level))
+        return parts[0] if len(parts) == 1 else self._merged(parts)
+
+    def _detect_at(self, grid: OccupancyGrid, level: Level) -> Detections:
+        """Detect what is looked for at one size of a map's cells, which the networks take for those they know."""
+        scale = level.resolution / self.card.resolution
+        known = replace(grid, frame=replace(grid.frame, resolution=self.card.resolution))
+        tiles = _tiles_of_things(known)
+        images = ((tile, tile_image(known, tile, self.card.style)) for tile in tiles)
+        lower, upper = (extent / level.resolution for extent in level.extents)
+        found = self.detect_tiles(images, known.frame, (self.options.slack * lower, upper / self.options.slack))
+        return found if math.isclose(scale, 1, rel_tol=1e-6) else _scaled(found, scale)
+
+    def _merged(self, parts: Sequence[Detections]) -> Detections:
+        """Put together what was detected in cells of several sizes."""
+        best = _best_first(one for part in parts for one in part.found)
+        found, overlapping = _reject_overlapping(best, self.options.max_overlap)
+        rivals = [pair for pair in overlapping if self._differs(pair[0], found)]
+        doubtful = [pair for part in parts for pair in part.doubtful if self._differs(pair[0], found)]
+        rejected = [*(rejection for _, rejection in overlapping), *(one for part in parts for one in part.rejected)]
+        return Detections(found, _best_first(rejected), tuple(doubtful), tuple(rivals))
+
+    def _differs(self, detection: Detection, others: Sequence[Detection]) -> bool:
+        """Return whether a detection differs in place or size from all others."""
+        limit = self.options.same_iou
+        return all(polygon_iou(detection.primitive, other.primitive) < limit for other in others)
+
+    def detect_tiles(
+        self,
+        images: Iterable[tuple[GridFrame, NDArray[np.uint8]]],
+        frame: GridFrame,
+        extents: tuple[float, float] = (0.0, math.inf),
+    ) -> Detections:
+        """Detect the primitives in a map that is given as images of its tiles.
+
+        Args:
+            images: Frames of tiles and their images (TILE_SIZE, TILE_SIZE, 3).
+            frame: The map's frame, with cells as the networks know them.
+            extents: From which to which extent (cells), from corner to corner, primitives are looked for.
+
+        Returns:
+            Detections, rejected and doubtful candidates.
+
+        Raises:
+            WeightsError: A network does not take its images, or gives outputs that are not finite.
+        """
+        parts = list(self._candidates(images, extents))
         boxes = Boxes.concatenate([part.boxes for part in parts])
         part_of = [part for part in parts for _ in range(len(part.boxes))]
         thresholds = np.array([self.thresholds[KINDS[kind]] for kind in boxes.kind.tolist()], np.float32)
@@ -165,7 +211,7 @@ class Detector:
         )
         suppressor = self._suppress(boxes, whole & (boxes.score >= thresholds), [len(part.boxes) for part in parts])
         kept, excess = self._best_of_each_tile(suppressor == np.arange(len(boxes)), boxes, part_of)
-        estimated = self._estimate(kept, boxes, part_of, frame)
+        estimated = self._estimate(kept, boxes, part_of, frame, extents)
         found, overlapping = _reject_overlapping(_best_first(estimated.values()), self.options.max_overlap)
         reasons = {
             i: self._reason(boxes, i, better, bool(whole[i]))
@@ -173,21 +219,25 @@ class Detector:
             if better != i
         }
         reasons |= dict.fromkeys(excess.tolist(), f"its tile has {self.options.max_per_tile} better ones")
-        reasons |= {i: "its tile holds no such primitive" for i in kept.tolist() if i not in estimated}
+        nowhere = "it is no primitive of a size that is looked for in such cells"
+        reasons |= {i: nowhere for i in kept.tolist() if i not in estimated}
         rejections = {i: _rejection(boxes, i, frame, reason) for i, reason in reasons.items()}
         chosen = self._doubtful(boxes, whole & (suppressor < 0), kept)
-        doubtful = self._estimate(chosen, boxes, part_of, frame)
+        doubtful = self._estimate(chosen, boxes, part_of, frame, extents)
         return Detections(
             found,
-            _best_first([*overlapping, *rejections.values()]),
+            _best_first([*(rejection for _, rejection in overlapping), *rejections.values()]),
             tuple((detection, rejections[i]) for i, detection in doubtful.items()),
         )
 
-    def _candidates(self, images: Iterable[tuple[GridFrame, NDArray[np.uint8]]]) -> Iterator[_TileCandidates]:
-        """Run YOLO on tiles; yield those with candidates."""
+    def _candidates(
+        self, images: Iterable[tuple[GridFrame, NDArray[np.uint8]]], extents: tuple[float, float]
+    ) -> Iterator[_TileCandidates]:
+        """Run YOLO on tiles; yield those with candidates of these extents (cells)."""
         for batch in _batches(iter(images), self.options.batch_size):
             stacked = np.stack([image for _, image in batch])
             for (tile, image), boxes in zip(batch, self.yolo(stacked, self.options.score_floor), strict=True):
+                boxes = boxes[_may_be_wanted(boxes, extents)]
                 if len(boxes):
                     grey = np.ascontiguousarray(image[..., 0])
                     if len(boxes) > self.options.max_candidates:
@@ -235,16 +285,22 @@ class Detector:
         return np.flatnonzero(chosen), np.flatnonzero(kept & ~chosen)
 
     def _estimate(
-        self, chosen: NDArray[np.intp], boxes: Boxes, part_of: Sequence[_TileCandidates], frame: GridFrame
+        self,
+        chosen: NDArray[np.intp],
+        boxes: Boxes,
+        part_of: Sequence[_TileCandidates],
+        frame: GridFrame,
+        extents: tuple[float, float],
     ) -> dict[int, Detection]:
         """Return those of some candidates by their indices that their crops show a primitive for, with parameters."""
         regions = [_region(part_of[i], boxes, i) for i in chosen.tolist()]
+        lower, upper = (extent * frame.resolution for extent in extents)
         return {
             i: Detection(
                 primitive, float(boxes.score[i]), _box_in_metres(boxes, i, frame), self.estimator.crop(region)
             )
             for i, region, primitive in zip(chosen.tolist(), regions, self.estimator(regions), strict=True)
-            if primitive is not None
+            if primitive is not None and lower <= 2 * primitive.bounding_radius <= upper
         }
 
     def _doubtful(self, boxes: Boxes, eligible: NDArray[np.bool_], kept: NDArray[np.intp]) -> NDArray[np.intp]:
@@ -270,8 +326,8 @@ class Detector:
 
 def _reject_overlapping(
     detections: Sequence[Detection], max_overlap: float
-) -> tuple[tuple[Detection, ...], list[Rejection]]:
-    """Split detections, best first, into those whose outlines are clear of better ones and the rejected rest."""
+) -> tuple[tuple[Detection, ...], list[tuple[Detection, Rejection]]]:
+    """Split detections, best first, into those whose outlines are clear of better ones, and the rest with reasons."""
     kept: list[Detection] = []
     rejected = []
     for detection in detections:
@@ -283,7 +339,7 @@ def _reject_overlapping(
         reason = f"its outline covers that of a better {better} by more than {max_overlap:g} of the smaller one"
         x0, y0, x1, y1 = detection.box
         kind = detection.primitive.kind
-        rejected.append(Rejection(kind, detection.score, (x0 + x1) / 2, (y0 + y1) / 2, reason))
+        rejected.append((detection, Rejection(kind, detection.score, (x0 + x1) / 2, (y0 + y1) / 2, reason)))
     return tuple(kept), rejected
 
 
@@ -299,12 +355,53 @@ def _best_first(items: Iterable[Scored]) -> tuple[Scored, ...]:
     return tuple(sorted(items, key=lambda item: -item.score))
 
 
-def _occupied_tiles(grid: OccupancyGrid) -> Iterator[GridFrame]:
-    """Yield the tiles that hold occupied cells."""
-    for tile in tile_frames(grid.frame):
-        part = clip_to_tile(grid, tile)
-        if part is not None and part.occupied.any():
-            yield tile
+def _may_be_wanted(boxes: Boxes, extents: tuple[float, float]) -> NDArray[np.bool_]:
+    """Return which boxes may bound primitives of some extents (cells): turned, a square's box is smaller by half."""
+    lower, upper = extents
+    sides = (boxes.box[:, 2:] - boxes.box[:, :2]).max(axis=1)
+    return np.asarray((sides >= lower / math.sqrt(2)) & (sides <= upper))
+
+
+def _tiles_of_things(grid: OccupancyGrid) -> Iterator[GridFrame]:
+    """Yield the tiles that show what stands isolated: the whole map where one tile does, else one around each group.
+
+    Of a map of many tiles most show walls, and nothing else.
+    """
+    occupied = grid.occupied
+    if max(grid.frame.shape) <= TILE_SIZE:
+        yield from tile_frames(grid.frame) if occupied.any() else ()
+        return
+    things = isolated_boxes(occupied, round(SEEN_CELLS))
+    while len(things):
+        tile = tile_around(things[0], grid.frame)
+        yield tile
+        things = things[1:][~_is_inside(things[1:], tile, grid.frame)]
+
+
+def _is_inside(boxes: NDArray[np.intp], tile: GridFrame, frame: GridFrame) -> NDArray[np.bool_]:
+    """Return which boxes (N, 4: first and last row and column) lie in a tile, with a margin where the map goes on."""
+    row, col = tile.row - frame.row, tile.col - frame.col
+    low = boxes[:, [0, 2]] - [row, col] >= TILE_MARGIN
+    high = [row + TILE_SIZE, col + TILE_SIZE] - boxes[:, [1, 3]] > TILE_MARGIN
+    return np.asarray((low & high).all(axis=1))
+
+
+def _scaled(found: Detections, scale: float) -> Detections:
+    """Return detections in a map whose cells are so many times as large."""
+
+    def larger(detection: Detection) -> Detection:
+        primitive = detection.primitive
+        size = tuple(scale * value for value in primitive.size)
+        made = replace(primitive, x=scale * primitive.x, y=scale * primitive.y, size=size)
+        x0, y0, x1, y1 = detection.box
+        return replace(detection, primitive=made, box=(scale * x0, scale * y0, scale * x1, scale * y1))
+
+    moved = {id(one): replace(one, x=scale * one.x, y=scale * one.y) for one in found.rejected}
+    return Detections(
+        tuple(larger(one) for one in found.found),
+        tuple(moved[id(one)] for one in found.rejected),
+        tuple((larger(one), moved[id(rejection)]) for one, rejection in found.doubtful),
+    )
 
 
 def _batches(items: Iterator[Item], size: int) -> Iterator[list[Item]]:

@@ -60,6 +60,26 @@ def connected_components(
     return np.asarray(labels, dtype=np.int32), is_large[labels]
 
 
+def isolated_boxes(occupied: BoolGrid, most: int) -> NDArray[np.intp]:
+    """Find what stands isolated: connected components of occupied cells, gaps of a cell closed, that are not large.
+
+    Args:
+        occupied: Occupied cells (rows, cols).
+        most: The most cells along an axis.
+
+    Returns:
+        (N, 4) first and last row and column of each, in the order of these.
+    """
+    import cv2
+
+    closed = cv2.morphologyEx(occupied.view(np.uint8), cv2.MORPH_CLOSE, np.ones((3, 3), np.uint8))
+    _, _, stats, _ = cv2.connectedComponentsWithStats(closed, connectivity=8, ltype=cv2.CV_32S)
+    col, row, width, height, _ = stats[1:].T.astype(np.intp)  # the first one is what is not occupied
+    boxes = np.column_stack((row, row + height - 1, col, col + width - 1))
+    boxes = boxes[np.maximum(width, height) <= most]
+    return np.asarray(boxes[np.lexsort((boxes[:, 2], boxes[:, 0]))])
+
+
 def label(cells: BoolGrid) -> NDArray[np.int32]:
     """Label the connected components of marked cells (8 neighbours): from 1 on, 0 where a cell is not marked."""
     import cv2

@@ -34,6 +34,8 @@ class WorldOptions:
         room: What the room has beside walls along the floor's edges: names of :mod:`recorder.rooms`.
         at_walls: How far from a wall every primitive stands (m); None: anywhere.
         touching: Whether primitives stand in pairs that touch each other.
+        sizes: The smallest and the largest extent of primitives and clutter (m), by their longest side or diameter,
+            all scales alike; None: the paper's.
     """
 
     size: tuple[float, float] = (2.0, 2.0)
@@ -44,6 +46,7 @@ class WorldOptions:
     room: tuple[str, ...] = ()
     at_walls: float | None = None
     touching: bool = False
+    sizes: tuple[float, float] | None = None
 
 
 @dataclass(frozen=True)
@@ -58,6 +61,9 @@ class OtherGenerators:
     room: np.random.Generator
     clutter: np.random.Generator
 
+
+THINNEST = 0.8
+"""The smallest width of primitives, as a share of their smallest extent: what the paper's ranges come to."""
 
 AMPLE_SPACING = 0.6
 """Primitives that have squares of this side (m) on average find places; set by hand."""
@@ -93,7 +99,7 @@ def draw_world(
         pieces = [shapely.Polygon(solid.outline) for solid in room.structure]
         ground = Ground(options.size, pieces, room.walls, placement, tries)
         primitives = _place(rng, kinds, ground, options)
-        clutter = None if primitives is None else _scatter(others.clutter, options.clutter, ground)
+        clutter = None if primitives is None else _scatter(others.clutter, options, ground)
         if primitives is not None and clutter is not None:
             world = World(options.size, tuple(primitives), (), tuple(clutter), room.structure)
             world = world.with_walls() if options.walls else world
@@ -127,23 +133,27 @@ def _place(
 ) -> list[Primitive] | None:
     """Draw primitives of these kinds; None where one found no place."""
     if options.touching:
-        return _place_pairs(rng, [kinds[i] for i in rng.permutation(len(kinds))], ground)
+        return _place_pairs(rng, [kinds[i] for i in rng.permutation(len(kinds))], ground, options.sizes)
     at_walls = options.at_walls
     settle = None if at_walls is None else lambda primitive: ground.to_wall(rng, primitive, at_walls)
     placed = []
     for kind in kinds:
-        primitive = ground.put(partial(draw_primitive, rng, kind, ground.size), Primitive.outline, settle)
+        primitive = ground.put(
+            partial(draw_primitive, rng, kind, ground.size, options.sizes), Primitive.outline, settle
+        )
         if primitive is None:
             return None
         placed.append(primitive)
     return placed
 
 
-def _place_pairs(rng: np.random.Generator, kinds: Sequence[Kind], ground: Ground) -> list[Primitive] | None:
+def _place_pairs(
+    rng: np.random.Generator, kinds: Sequence[Kind], ground: Ground, sizes: tuple[float, float] | None
+) -> list[Primitive] | None:
     """Draw primitives of which each second one touches the one before it; None where one found no place."""
     placed: list[Primitive] = []
     for index, kind in enumerate(kinds):
-        draw = partial(draw_primitive, rng, kind, ground.size)
+        draw = partial(draw_primitive, rng, kind, ground.size, sizes)
         if index % 2:
             primitive = ground.put(
                 partial(_draw_beside, rng, draw, placed[-1], ground.placement), Primitive.outline, None, ground.latest
@@ -162,12 +172,14 @@ def _draw_beside(
     return beside(rng, draw(), other, placement)
 
 
-def _scatter(rng: np.random.Generator, counts: tuple[int, int], ground: Ground) -> list[Solid] | None:
+def _scatter(rng: np.random.Generator, options: WorldOptions, ground: Ground) -> list[Solid] | None:
     """Draw clutter, apart from all that stands there; None where it found no place."""
     scattered: list[Solid] = []
-    for _ in range(rng.integers(*counts, endpoint=True)):
+    for _ in range(rng.integers(*options.clutter, endpoint=True)):
         for _ in range(ground.placement.things):
             name, outline = draw_thing(rng)
+            if options.sizes is not None:
+                outline = outline * (_extent(rng, options.sizes) / np.ptp(outline, axis=0).max())
             placed = ground.put(partial(put_anywhere, rng, outline, ground.size), np.asarray)
             if placed is not None:
                 scattered.append(Solid.of(name, placed))
@@ -177,18 +189,35 @@ def _scatter(rng: np.random.Generator, counts: tuple[int, int], ground: Ground) 
     return scattered
 
 
-def draw_primitive(rng: np.random.Generator, kind: Kind, size: tuple[float, float]) -> Primitive:
+def _extent(rng: np.random.Generator, sizes: tuple[float, float]) -> float:
+    """Draw an extent (m) of which all scales are alike."""
+    return math.exp(rng.uniform(math.log(sizes[0]), math.log(sizes[1])))
+
+
+def _sized(rng: np.random.Generator, kind: Kind, sizes: tuple[float, float]) -> tuple[float, ...]:
+    """Draw a kind's sizes (m): proportions as its row has them, of any scale; none much thinner than the smallest."""
+    while True:
+        lengths = kind.row.draw(rng)
+        scale = _extent(rng, sizes) / (kind.extent * max(lengths))
+        if scale * kind.extent * min(lengths) >= THINNEST * sizes[0]:
+            return tuple(scale * length for length in lengths)
+
+
+def draw_primitive(
+    rng: np.random.Generator, kind: Kind, size: tuple[float, float], sizes: tuple[float, float] | None = None
+) -> Primitive:
     """Draw one primitive: sizes as its kind's row in the table of kinds has it, heading and place uniform.
 
     Args:
         rng: Draws it.
         kind: Its kind.
         size: The floor, along x and y (m).
+        sizes: The smallest and the largest extent (m), all scales alike: only the proportions are those of the row.
 
     Returns:
         The primitive, its centroid on the floor.
     """
-    lengths = kind.row.draw(rng)
+    lengths = kind.row.draw(rng) if sizes is None else _sized(rng, kind, sizes)
     theta = rng.uniform(0, 2 * math.pi) if kind.has_angle else None
     x, y = (rng.uniform(-length / 2, length / 2) for length in size)
     return Primitive(kind, x, y, theta, lengths).canonical()

@@ -318,7 +318,7 @@ def refine(
     """
     from detect.refinement.options import DEFAULTS
     from detect.refinement.refine import Refinement, detection_of, rejection_reason
-    from detect.refinement.surroundings.map_cells import MapCells
+    from detect.refinement.surroundings.levels import MapLevels
 
     guesses, noise_std = _checked_guesses(primitives), _checked_noise(noise_std)
     if not isinstance(closed_world, bool):
@@ -328,9 +328,8 @@ def refine(
     fitted = [
         k for k, guess in enumerate(guesses) if not _overlaps(guess, guesses[:k], DEFAULTS.acceptance.max_shared)
     ]
-    cells = MapCells.of(grid, DEFAULTS.map, DEFAULTS.lines)
-    options = replace(DEFAULTS, closed_world=closed_world)
-    refinement = Refinement(cells, noise_std, cores(), options=options)
+    levels = MapLevels.of(grid, replace(DEFAULTS, closed_world=closed_world))
+    refinement = Refinement(levels, noise_std, cores())
     fits = refinement.run([guesses[k] for k in fitted], _checked_pairs(scans))
     found: list[FoundPrimitive | None] = [None] * len(guesses)
     for k, fit in zip(fitted, fits, strict=True):

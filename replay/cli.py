@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
+from mapping.pyramid import DEFAULT_SIZES
 from prim import __version__, console
 from prim.choices import ClockName, MapperName, PoseSourceName, SensorModelName, SweepName
 from prim.errors import InterruptedRunError, PrimError, UsageError
@@ -155,6 +156,10 @@ def replay(
     no_refine: Annotated[
         bool, typer.Option("--no-refine", help="Keep the networks' estimates: no fit to the rays.")
     ] = False,
+    sizes: Annotated[
+        tuple[float, float],
+        typer.Option(metavar="MIN MAX", help="Objects to look for, by their longest side or diameter, metres."),
+    ] = DEFAULT_SIZES,
     closed_world: Annotated[
         bool,
         typer.Option("--closed-world", help="Take all that stands there to be one of the kinds, or a wall."),
@@ -270,6 +275,7 @@ def replay(
         detect=not no_detect,
         detect_every=_parse_interval(detect_every),
         refine=not no_refine,
+        sizes=sizes,
         closed_world=closed_world,
         weights=weights,
         recover=recover,

@@ -12,6 +12,7 @@ import numpy as np
 from detect.refinement.options import DEFAULTS as REFINEMENT
 from detect.refinement.options import RefinementOptions
 from mapping.mapper import check_cells, check_mapper, takes_noise
+from mapping.pyramid import DEFAULT_SIZES
 from prim.choices import ClockName, MapperName, PoseSourceName, SensorModelName, SweepName
 from prim.errors import UsageError
 from prim.se2 import Pose2D
@@ -29,6 +30,9 @@ MIN_RATE, MAX_RATE = 1e-3, 1e6
 
 MIN_POSE_NOISE, MAX_POSE_NOISE = 1e-9, 1e6
 """The smallest and the largest standard deviations of poses (m, rad) that can be given; set by hand."""
+
+MIN_SIZE, MAX_SIZE = 1e-3, 100.0
+"""The smallest and the largest object (m) that can be looked for; set by hand."""
 
 MAX_TURN = 2 * math.pi
 """The largest turn (rad) of a laser on its robot: larger ones are degrees given as radians."""
@@ -71,6 +75,7 @@ class ReplayOptions:
         detect_every: N to detect primitives after the first scan, after every N scans, and at the end; «end» for the
             end only; None for eight times where the replay is shown, else the end only.
         refine: Whether detections are refined with the rays.
+        sizes: The smallest and the largest object that is looked for (m), by its longest side or its diameter.
         closed_world: Whether all that stands there is taken to be one of the kinds, or a wall; else what is likeliest
             none of the kinds is an object without one.
         weights: The weights of the detector; None for those that come with prim.
@@ -104,6 +109,7 @@ class ReplayOptions:
     detect: bool = True
     detect_every: int | Literal["end"] | None = None
     refine: bool = True
+    sizes: tuple[float, float] = DEFAULT_SIZES
     closed_world: bool = False
     weights: Path | None = None
     recover: bool = False
@@ -124,6 +130,7 @@ class ReplayOptions:
             raise UsageError(f"--detect-every is {every}: it must be a number of scans, at least 1, or «{END}»")
         if not self.detect and (self.detect_every or self.weights or not self.refine):
             raise UsageError("--no-detect excludes --detect-every, --weights and --no-refine")
+        self._check_sizes()
         if self.closed_world and not (self.detect and self.refine):
             raise UsageError("--closed-world is for refinement: it excludes --no-detect and --no-refine")
         if self.clock not in [*ClockName]:
@@ -147,7 +154,8 @@ class ReplayOptions:
     @property
     def refinement(self) -> RefinementOptions:
         """The numeric parameters of refinement."""
-        return replace(REFINEMENT, closed_world=self.closed_world)
+        evidence = replace(REFINEMENT.evidence, sizes=self.sizes)
+        return replace(REFINEMENT, evidence=evidence, closed_world=self.closed_world)
 
     @property
     def mappers(self) -> tuple[str, ...]:
@@ -184,6 +192,16 @@ class ReplayOptions:
             check_mapper(self.mappers[0], self.sensor_model)
         if self.noise_std not in noises:
             check_mapper(self.mappers[0], noise_std=self.noise_std)
+
+    def _check_sizes(self) -> None:
+        smallest, largest = self.sizes
+        if not MIN_SIZE <= smallest <= largest / 2 or not largest <= MAX_SIZE:
+            raise UsageError(
+                f"--sizes is {smallest:g} {largest:g}: give the smallest and the largest size, at least twice as large, "
+                f"from {MIN_SIZE:g} to {MAX_SIZE:g} m, such as --sizes 0.05 2"
+            )
+        if self.sizes != DEFAULT_SIZES and not self.detect:
+            raise UsageError("--sizes is for detection: it excludes --no-detect")
 
     def _check_poses(self) -> None:
         if self.standing_still and (self.pose != "auto" or self.odom_topic):

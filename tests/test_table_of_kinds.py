@@ -40,7 +40,7 @@ REFINE_FROM_ROUGH_STARTS = """
 import json, math
 from dataclasses import replace
 import numpy as np
-from detect.refinement.surroundings.map_cells import MapCells
+from detect.refinement.surroundings.levels import MapLevels
 from detect.refinement.refine import Refinement
 from prim.shapes import Kind, Primitive, angle_error
 from tests.detect.refinement.rooms import mapped, room, scans
@@ -60,7 +60,7 @@ for seed in range(3):
         for kind, (x, y) in zip(kinds, places)
     ))
     taken = scans(world, 0.05, seed=seed)
-    results = Refinement(MapCells.of(mapped(taken))).run([disturbed(p, rng) for p in world.primitives], taken)
+    results = Refinement(MapLevels.of(mapped(taken))).run([disturbed(p, rng) for p in world.primitives], taken)
     for made, true in zip(results, world.primitives):
         assert made is not None and made.primitive.kind is true.kind, (made, true)
         assert made.score == max(made.kind_probabilities.values()) * (1 - made.other_probability) > 0.9, made

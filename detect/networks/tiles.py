@@ -22,6 +22,9 @@ TILE_OVERLAP = 80
 """Smallest overlap (cells) of neighbouring tiles: a third more than the recorder's widest primitive, so that each
 primitive lies whole in some tile."""
 
+TILE_MARGIN = 24
+"""Cells around what a tile is made for, where the map goes on: what is beside it tells it from a part; set by hand."""
+
 STYLES = ("grey", "rounded")
 """How cells are rendered in three channels; model cards hold the names.
 
@@ -49,6 +52,27 @@ def _tile_starts(first: int, cells: int) -> list[int]:
         return [first - (TILE_SIZE - cells) // 2]
     count = math.ceil((cells - TILE_OVERLAP) / (TILE_SIZE - TILE_OVERLAP))
     return [first + round(k * (cells - TILE_SIZE) / (count - 1)) for k in range(count)]
+
+
+def tile_around(box: NDArray[np.intp], frame: GridFrame) -> GridFrame:
+    """Return a tile with something near its first corner, within a map where that is large enough.
+
+    Args:
+        box: (4,) its first and last row and column, from the map's first cell on.
+        frame: The map's frame.
+
+    Returns:
+        The tile's frame.
+    """
+
+    def start(first: int, begin: int, cells: int) -> int:
+        """Return the tile's first cell along one axis."""
+        if cells <= TILE_SIZE:
+            return begin - (TILE_SIZE - cells) // 2
+        return begin + min(max(first - TILE_MARGIN, 0), cells - TILE_SIZE)
+
+    row, col = start(int(box[0]), frame.row, frame.rows), start(int(box[2]), frame.col, frame.cols)
+    return GridFrame(frame.resolution, row, col, TILE_SIZE, TILE_SIZE)
 
 
 def clip_to_tile(grid: OccupancyGrid, tile: GridFrame) -> OccupancyGrid | None:

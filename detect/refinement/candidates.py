@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, field
@@ -11,9 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from detect.detection import Detection
-from detect.refinement.fitting.evidence import laplace_evidence, max_size
+from detect.refinement.fitting.evidence import laplace_evidence, size_bounds
 from detect.refinement.fitting.fit import SPECIAL_CASES, KindFit, fit_all_kinds, refit, refit_same_kind
 from detect.refinement.likelihood.geometry import JACOBIANS, parameters_of, primitive_of, ranges_to
+from detect.refinement.likelihood.kernels import ORIGIN_X, ORIGIN_Y
 from detect.refinement.likelihood.rays import RayBundle
 from detect.refinement.likelihood.scanner_errors import (
     NO_ERRORS,
@@ -30,10 +30,11 @@ from detect.refinement.likelihood.sensor_model import (
 )
 from detect.refinement.options import DEFAULTS, RefinementOptions
 from detect.refinement.outlines.free_outline import ranges_of
-from detect.refinement.surroundings.map_cells import MapCells
+from detect.refinement.surroundings.map_cells import MapCells, is_within
 from detect.refinement.surroundings.walls import Wall, walls_behind
 from detect.refinement.wall_surfaces import measure_walls, sharpen
-from prim.arrays import FloatArray
+from prim.arrays import BoolGrid, FloatArray
+from prim.metrics import overlap_coefficient
 from prim.shapes import Primitive
 
 
@@ -74,6 +75,7 @@ class Candidate:
     outline: FloatArray | None = None
     current: Primitive = field(init=False)
     _cached: tuple[Background, tuple[float, float], FloatArray] | None = None
+    _passed: dict[int, bool] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         self.current = self.start
@@ -88,7 +90,7 @@ class Candidate:
         """Return its rays with what they measure where they miss it: the map, walls and other candidates.
 
         Args:
-            others: All candidates; those far away, and itself, are passed over.
+            others: All candidates; those that no ray of it passes, and itself, are passed over.
             sensor: The sensor.
             errors: Errors of the scanner that are taken out; None: those that are known.
             shape: Where it is thought to be, which these depend on; None: where it was fitted last.
@@ -101,8 +103,7 @@ class Candidate:
         beams = sensor.std, sensor.dropout_share
         if self._cached is None or self._cached[0] is not background or self._cached[1] != beams:
             self._cached = background, beams, background_log_likelihood(self.bundle, background, sensor)
-        reach = self.options.map.occluder_distance
-        near = [other for other in others if other is not self and centroid_distance(other.start, self.start) < reach]
+        near = [other for other in others if other is not self and self._may_be_occluded_by(other)]
         shapes = [other.current for other in near if other.outline is None]
         walls = [wall.stretch for wall in self.walls]
         occlusion = [ranges_of(other.outline, self.bundle) for other in near if other.outline is not None]
@@ -111,6 +112,17 @@ class Candidate:
             around = Surroundings(background, self._cached[2], shapes, walls, occlusion)
             return without_errors(self.bundle, around, shape or self.current, sensor, errors)
         return with_background(self.bundle, background, self._cached[2], [*shapes, *walls], sensor, occlusion)
+
+    def _may_be_occluded_by(self, other: Candidate) -> bool:
+        """Tell whether some of its rays pass another candidate where that was first, or nearby; it is asked once.
+
+        What would stand in its own place is a rival, and does not occlude it.
+        """
+        if id(other) not in self._passed:
+            is_rival = overlap_coefficient(self.start, other.start) > self.options.acceptance.max_shared
+            passes = self.bundle.passing(other.start, other.options.rays.reach).any()
+            self._passed[id(other)] = bool(passes and not is_rival)
+        return self._passed[id(other)]
 
     def keep_rays(self, chosen: NDArray[np.bool_]) -> None:
         """Leave out all rays but the chosen ones (N,)."""
@@ -123,6 +135,11 @@ class Candidate:
         """The rays, with their background, that it was fitted to last."""
         assert self.fitted_to is not None
         return self.fitted_to[1]
+
+    def holds_laser(self) -> bool:
+        """Tell whether some ray begins in what it was taken for: that is then a room, or a part of one."""
+        origins = np.unique(self.bundle.rays[[ORIGIN_X, ORIGIN_Y]], axis=1).T
+        return bool(is_within(self.start, origins, 0.0).any())
 
     def surface_ranges(self, bundle: RayBundle) -> FloatArray:
         """Return the ranges (N,) in m at which rays meet its free outline, else the primitive; FAR for a miss."""
@@ -138,7 +155,7 @@ class Candidate:
 
     def is_possible(self, primitive: Primitive) -> bool:
         """Tell whether a primitive in its place keeps off walls and is no larger than the prior allows."""
-        if max(parameters_of(primitive)[3:]) >= max_size(primitive.kind, self.options.evidence):
+        if max(parameters_of(primitive)[3:]) >= size_bounds(primitive.kind, self.options.evidence)[1]:
             return False
         own = (wall for wall in self.walls if wall.behind is self.start)
         depth = self.options.walls.depth
@@ -214,28 +231,65 @@ def _is_unchanged(
     return same_noise and before.footprint == sensor.footprint and fitted_to.is_similar(bundle, options)
 
 
-def find_backgrounds(
-    pool: Executor,
-    candidates: Sequence[Candidate],
-    cells: MapCells,
-    margin: float,
-    options: RefinementOptions = DEFAULTS,
-) -> list[bool]:
+def find_backgrounds(pool: Executor, candidates: Sequence[Candidate], is_first: bool = False) -> list[bool]:
     """Read from the map what stands behind each candidate: the map without the candidates' own cells.
 
     Args:
         pool: The threads.
         candidates: The candidates; their background and walls are set.
-        cells: The map.
-        margin: Cells this near (m) to a candidate are its own.
-        options: How walls are found.
+        is_first: Whether they are not fitted yet, so that more of the cells around them may be their own.
 
     Returns:
         For each candidate whether its background has changed much.
     """
+    changed: dict[int, bool] = {}
+    for part in by_level(candidates):
+        found = _find_backgrounds_at(pool, part, candidates, is_first)
+        changed |= {id(candidate): was for candidate, was in zip(part, found, strict=True)}
+    return [changed[id(candidate)] for candidate in candidates]
+
+
+def by_level(candidates: Sequence[Candidate]) -> list[list[Candidate]]:
+    """Part candidates by the cells that they are seen in, those of the first one first."""
+    parts: dict[int, list[Candidate]] = {}
+    for candidate in candidates:
+        parts.setdefault(id(candidate.cells), []).append(candidate)
+    return list(parts.values())
+
+
+def without_candidates(cells: MapCells, candidates: Sequence[Candidate], is_first: bool = False) -> BoolGrid:
+    """Return the occupied cells (rows, cols) of a map but for those of candidates, which may be seen in others.
+
+    Args:
+        cells: The map.
+        candidates: The candidates.
+        is_first: Whether they are not fitted yet, so that more of the cells around them may be their own.
+
+    Returns:
+        (rows, cols) bool.
+    """
+    occupied = cells.occupied
+    for part in by_level(candidates):
+        own, limits = part[0].cells, part[0].options.map
+        coarser = max(cells.frame.resolution - own.frame.resolution, 0.0)
+        margin = (limits.cleared_first if is_first else limits.cleared) + coarser
+        is_finer = own.frame.resolution > cells.frame.resolution  # what is large in finer cells is the thing itself
+        touching = margin if is_finer else limits.touching + coarser
+        shapes = [candidate.current for candidate in part]
+        occupied = occupied & cells.without(shapes, margin, touching, limits.blur + coarser)
+    return occupied
+
+
+def _find_backgrounds_at(
+    pool: Executor, candidates: Sequence[Candidate], present: Sequence[Candidate], is_first: bool
+) -> list[bool]:
+    """Read from one map what stands behind the candidates that are seen in it, all others that are present left out."""
+    cells, options = candidates[0].cells, candidates[0].options
     shapes, guesses = [one.current for one in candidates], [one.start for one in candidates]
-    occupied = cells.without(shapes, margin)
-    walls = walls_behind(cells, shapes, guesses, options.walls, options.lines)
+    own = {id(candidate) for candidate in candidates}
+    beside = [candidate.current for candidate in present if id(candidate) not in own]
+    occupied = without_candidates(cells, present, is_first)
+    walls = walls_behind(cells, shapes, guesses, beside, options.walls, options.lines)
     for wall in walls:
         occupied[wall.cells] = False
     distances = DistanceMap.of(occupied, cells.frame)
@@ -246,8 +300,7 @@ def find_backgrounds(
         background = sharpen(cast, candidate.bundle, straight, cells.frame.resolution, options.surfaces)
         limits = candidate.options.map
         before, candidate.background = candidate.background, background
-        near = limits.occluder_distance
-        candidate.walls = [wall for wall in walls if centroid_distance(wall.stretch, candidate.start) < near]
+        candidate.walls = [wall for wall in walls if candidate.bundle.passing(wall.stretch, 0.0).any()]
         if before is None:
             changed.append(True)
             continue
@@ -265,16 +318,3 @@ def _rays_beside(
         clear = ~candidate.bundle.passing(candidate.current, options.surfaces.clear)
         pairs.append((candidate.bundle.select(clear), background.select(clear)))
     return pairs
-
-
-def centroid_distance(a: Primitive, b: Primitive) -> float:
-    """Return the distance (m) of two primitives' centroids.
-
-    Args:
-        a: One.
-        b: The other.
-
-    Returns:
-        Metres.
-    """
-    return math.hypot(a.x - b.x, a.y - b.y)

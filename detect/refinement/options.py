@@ -2,11 +2,27 @@
 
 Where no source is named a number was set by hand, and is tested only by what ``python -m bench.refine`` measures of
 the whole (docs/refine.md).
+
+Lengths that go with the size of what is fitted are marked by :func:`scaled`: they hold for things of up to 0.7 m in a
+map with cells of 1 cm, and :meth:`RefinementOptions.at_scale` multiplies them for larger things in larger cells.
+Lengths that go with the sensor stay.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+import math
+from dataclasses import dataclass, field, fields, is_dataclass, replace
+from typing import Any
+
+from mapping.pyramid import DEFAULT_SIZES
+
+SCALED = "scaled"
+"""Key of the fields' metadata that marks the lengths which go with the size of what is fitted."""
+
+
+def scaled(metres: float) -> Any:
+    """Make a field for a length (m) that goes with the size of what is fitted."""
+    return field(default=metres, metadata={SCALED: True})
 
 
 @dataclass(frozen=True)
@@ -17,13 +33,13 @@ class RayOptions:
     """Rays of one candidate; of more than twice as many every other scan is left out. Bounds the time."""
     max_range: float = 1000.0
     """m; a sensor whose range_max is larger, or infinite, is taken to reach so far."""
-    reach: float = 0.07
+    reach: float = scaled(0.07)
     """m; rays that pass a candidate at this distance are collected."""
-    fitted_reach: float = 0.03
+    fitted_reach: float = scaled(0.03)
     """m; the same once it is fitted."""
     similar_nats: float = 0.5
     """nats; a ray's background has changed where its log-likelihood differs by more."""
-    similar_range: float = 0.01
+    similar_range: float = scaled(0.01)
     """m; or where its occlusion does."""
     similar_share: float = 0.01
     """A candidate is not fitted again where a smaller share of its rays has changed."""
@@ -173,7 +189,7 @@ class FitOptions:
     """From the best coarse fits."""
     last: Descent = Descent((0.012, 0.004, 0.001, 0.0003), 10, 0.1)
     """From earlier fits, with all rays."""
-    information_blur: float = 0.001
+    information_blur: float = scaled(0.001)
     """m; information of silhouettes is asked with this blur at least: at narrower ones single jumps count for all."""
     kind_cost_margin: float = 60.0
     """nats; a kind whose coarse fit is less likely by this much than the best is not fitted to more rays."""
@@ -188,7 +204,7 @@ class FitOptions:
     EvidenceOptions.mode_margin, since modes of equal cost differ in volume."""
     modes_kept: int = 3
     """Modes of a kind that are kept: a triangle has three apexes. Bounds the time."""
-    max_extent: float = 0.7
+    max_extent: float = scaled(1.0)
     """m; EvidenceOptions.max_extent: a fit that is larger is no shape by the prior, …"""
     too_large_nats: float = 1.0
     """nats; … and one that is not is preferred to it where it is less likely by no more."""
@@ -196,7 +212,7 @@ class FitOptions:
     """Shapes scattered about the best fit of a likely kind, from which it is fitted again;"""
     scatter: float = 4.0
     """their standard deviations, in those of the fit: other maxima lie 4 to 10 of them away (README's outliers)."""
-    scatter_blur: float = 0.004
+    scatter_blur: float = scaled(0.004)
     """m; with which they are compared."""
     scatter_kept: int = 2
     """How many of them are fitted."""
@@ -225,7 +241,7 @@ class FitOptions:
     """The same, below which they are kept; in between both are the mean."""
     min_size: float = 0.02
     """m; bounds of width and height (of semi-axes) during a descent; the recorder draws no smaller ones."""
-    max_size: float = 1.2
+    max_size: float = scaled(1.2)
     """m."""
 
 
@@ -233,8 +249,15 @@ class FitOptions:
 class EvidenceOptions:
     """Marginal likelihoods by importance sampling."""
 
-    max_extent: float = 0.7
-    """m; the prior of sizes is uniform up to this extent: twice the recorder's largest (0.32 m), and some."""
+    sizes: tuple[float, float] = DEFAULT_SIZES
+    """m; the smallest and the largest object that is wanted, by its longest side or its diameter. The prior of each
+    size is scale-free over what these allow: as likely between 0.1 and 0.2 m as between 1 and 2 m."""
+    size_margin: float = 1.25
+    """By this factor larger or smaller ones are objects, too: where a bound is, is not meant exactly."""
+    thinnest: float = 0.2
+    """The prior's lower bound of each size, as a share of the smallest object."""
+    max_extent: float = scaled(1.0)
+    """m; no fit is larger: something above the 0.7 m of what is looked for at this scale."""
     contender: float = 7.0
     """nats; kinds within this of the best one's Laplace approximation are sampled: e^-7 is below 0.1 %."""
     mode_margin: float = 9.0
@@ -272,14 +295,26 @@ class EvidenceOptions:
     log_evidence_margin: float = 30.0
     """nats (times the dispersion); a kind whose evidence is less by this much is not fitted again."""
 
+    @property
+    def bounds(self) -> tuple[float, float]:
+        """The bounds (m) of a size at this scale, as the extent that it is of."""
+        smallest, largest = self.sizes
+        return self.thinnest * smallest, min(self.size_margin * largest, self.max_extent)
+
+    @property
+    def log_size_density(self) -> float:
+        """The log of the prior density of a size's logarithm, which is uniform over all scales."""
+        smallest, largest = self.sizes
+        return -math.log(math.log(self.size_margin * largest / (self.thinnest * smallest)))
+
 
 @dataclass(frozen=True)
 class MapOptions:
     """Which cells of a map belong to walls, and which may belong to primitives."""
 
-    max_extent: float = 0.75
+    max_extent: float = scaled(0.75)
     """m; connected components that extend further are no primitives: somewhat above EvidenceOptions.max_extent."""
-    min_wall: float = 0.8
+    min_wall: float = scaled(0.8)
     """m; a straight line with surface cells over this length is a wall: longer than any primitive."""
     max_walls: int = 16
     """Detection of walls in a map."""
@@ -297,26 +332,24 @@ class MapOptions:
     """m; a wall that is free on one side only reaches so far to the other."""
     one_sided: float = 0.2
     """Share of free cells, of the other side's, below which a side is not free."""
-    min_opening: float = 0.1
+    min_opening: float = scaled(0.1)
     """m; a wall is open where it has no cells over this length at least: noise wears smaller holes into walls."""
-    min_span: float = 0.4
+    min_span: float = scaled(0.4)
     """m; between openings a wall is as long at least: a primitive may stand in a doorway."""
-    penetration: float = 0.025
+    penetration: float = scaled(0.025)
     """m; what reaches further behind such a wall is no primitive."""
-    touching: float = 0.008
+    touching: float = scaled(0.008)
     """m; a wall's cells this near to a primitive count as the primitive's."""
-    moved_range: float = 0.05
+    moved_range: float = scaled(0.05)
     """m; a background has changed where rays end elsewhere by more …"""
     moved_share: float = 0.1
     """… for more than this share of them."""
-    cleared_first: float = 0.03
+    cleared_first: float = scaled(0.03)
     """m; occupied cells around a candidate that are its own, before it is fitted."""
-    cleared: float = 0.02
+    cleared: float = scaled(0.02)
     """m; and afterwards."""
-    blur: float = 0.1
+    blur: float = scaled(0.1)
     """m; noise blurs a primitive so far into the map: connected cells this near are its own."""
-    occluder_distance: float = 2.5
-    """m; candidates further apart do not occlude each other: few rays pass both."""
 
 
 @dataclass(frozen=True)
@@ -341,23 +374,23 @@ class LineOptions:
 class WallOptions:
     """Straight walls behind candidates that stand close to them."""
 
-    near: float = 0.12
+    near: float = scaled(0.12)
     """m; walls are considered as the background of candidates this near to them,"""
-    around: float = 0.5
+    around: float = scaled(0.5)
     """m; by its cells this far around,"""
-    min_length: float = 0.12
+    min_length: float = scaled(0.12)
     """m; seen over this length on both sides,"""
-    own: float = 0.04
+    own: float = scaled(0.04)
     """m; leaving out cells this near to a candidate."""
     width: float = 2.0
     """cells; its cells lie this near to its line, along which noise has bent it."""
     cells: float = 3.5
     """cells; cells this near to the stretch stand for it."""
-    depth: float = 0.02
+    depth: float = scaled(0.02)
     """m; a primitive may reach so far into it: its line is known no better."""
     thickness: float = 0.002
     """m; of the rectangle that stands for it."""
-    beyond: float = 0.15
+    beyond: float = scaled(0.15)
     """m; that reaches so far beyond a candidate on both sides."""
 
 
@@ -371,7 +404,7 @@ class SurfaceOptions:
     """Cosine; rays more oblique than this do not say where a wall is."""
     min_rays: int = 50
     """Fewer rays measure no wall."""
-    clear: float = 0.03
+    clear: float = scaled(0.03)
     """m; rays that pass a candidate nearer than this may have met it."""
     iterations: int = 5
     """Of the robust regression,"""
@@ -389,17 +422,17 @@ class ProposalOptions:
 
     max_proposals: int = 24
     """The largest components that are proposed: a map full of speckle has many."""
-    min_extent: float = 0.03
+    min_extent: float = scaled(0.03)
     """m; smallest extent of a component."""
-    max_extent: float = 0.7
-    """m; largest one: EvidenceOptions.max_extent."""
+    max_extent: float = scaled(0.7)
+    """m; largest one, along its longer side."""
     min_cells: int = 6
     """Cells of a component."""
     max_covered: float = 0.3
     """Share of a component's cells within a known primitive from which on it is part of that."""
     min_free: float = 0.3
     """Share of the cells around it that are free: what lies behind a wall is not seen."""
-    near: float = 0.03
+    near: float = scaled(0.03)
     """m; cells this near to a primitive count as within it."""
 
 
@@ -446,7 +479,7 @@ class OutlineOptions:
     """Bounds of the logarithm of a radius over the primitive's."""
     descent: Descent = Descent((0.012, 0.004, 0.001), 12, 0.1)
     """From the primitive's outline."""
-    test_blur: float = 0.012
+    test_blur: float = scaled(0.012)
     """m; of silhouettes in the score test: further than from there no step of it reaches."""
     suspicious: float = 5.0
     """nats; only where the score test promises a gain of so much is a free outline fitted."""
@@ -460,7 +493,7 @@ class OutlineOptions:
     max_damping: float = 1e4
     damping_after_success: float = 0.2
     damping_after_failure: float = 8.0
-    information_blur: float = 0.001
+    information_blur: float = scaled(0.001)
     """m; as FitOptions.information_blur."""
 
 
@@ -468,7 +501,7 @@ class OutlineOptions:
 class PolygonOptions:
     """Free polygons, from the contour of a candidate's cells."""
 
-    around: float = 0.08
+    around: float = scaled(0.08)
     """m; the contour is searched this far around the candidate's circle,"""
     around_cells: float = 6.0
     """cells; and this far at least."""
@@ -492,15 +525,15 @@ class PolygonOptions:
     """To all rays."""
     tries: int = 3
     """Vertices whose removal is tried, those that span the smallest triangles, before all stay."""
-    pull: float = 0.04
+    pull: float = scaled(0.04)
     """m; standard deviation of vertices about where a descent begins: the contour is no further off."""
-    spread: float = 0.35
+    spread: float = scaled(0.35)
     """m; standard deviation of vertices about the first one under the prior: half of EvidenceOptions.max_extent."""
     vertex_odds: float = 2.0
     """By this factor a polygon with one more vertex is less likely a priori."""
     least_blur: float = 0.0005
     """m; of silhouettes."""
-    information_blur: float = 0.001
+    information_blur: float = scaled(0.001)
     """m; as FitOptions.information_blur."""
     first_damping: float = 1e-2
     """As those of FitOptions."""
@@ -534,7 +567,7 @@ class TemplateOptions:
     """Third stage."""
     least_blur: float = 0.0005
     """m; of silhouettes."""
-    information_blur: float = 0.001
+    information_blur: float = scaled(0.001)
     """m; as FitOptions.information_blur."""
     min_size: float = 0.02
     """m; as FitOptions.min_size."""
@@ -552,27 +585,27 @@ class TemplateOptions:
 class ContactOptions:
     """When a candidate is a part of something larger."""
 
-    occluder_distance: float = 2.5
-    """m; as MapOptions.occluder_distance."""
+    occluder_distance: float = scaled(2.5)
+    """m; primitives that are further away are left in the map."""
     edge: float = 0.5
     """cells; unexplained cells touch a candidate where they are further off its outline than this"""
     touch: float = 2.5
     """cells; and no further than this."""
-    far: float = 0.15
+    far: float = scaled(0.15)
     """m; cells connected with these count up to this far from the outline,"""
     far_cells: float = 8.0
     """cells; and up to this far at least."""
-    own: float = 0.02
+    own: float = scaled(0.02)
     """m; another primitive explains cells this near,"""
     own_cells: float = 1.5
     """cells; or this near;"""
-    wall_width: float = 0.035
+    wall_width: float = scaled(0.035)
     """m; a wall those this near to its line,"""
     wall_width_cells: float = 1.6
     """cells; or this near."""
     wall_extension: float = 0.2
     """m; a wall may go on so far behind a candidate, beyond where it is seen."""
-    wall_depth: float = 0.02
+    wall_depth: float = scaled(0.02)
     """m; a candidate that reaches further behind a wall's line is not explained by it,"""
     wall_depth_cells: float = 0.4
     """cells; this far at least."""
@@ -582,7 +615,7 @@ class ContactOptions:
     """… of which more than this share is free: else the candidate is a part of what stands behind the wall."""
     beside: float = 1.5
     """cells; the strip begins this far beside the candidate."""
-    cleared: float = 0.02
+    cleared: float = scaled(0.02)
     """m; cells this near to primitives are theirs."""
     passing: float = 0.002
     """m; rays whose line passes a candidate by more count."""
@@ -632,9 +665,9 @@ class TouchingOptions:
 
     around: float = 1.5
     """cells; a component of the map belongs to a candidate where its cells are this near to it."""
-    max_radius: float = 0.7
+    max_radius: float = scaled(0.7)
     """m; of the circle around a component; larger ones are no two primitives: EvidenceOptions.max_extent."""
-    reach: float = 0.03
+    reach: float = scaled(0.03)
     """m; rays that pass that circle at this distance are needed."""
     unexplained: float = 0.25
     """Share of a component's cells that no candidate covers, above which two things are tried although each
@@ -667,9 +700,9 @@ class TouchingOptions:
     """Share of the smaller area that parts have in common at most: things do not overlap."""
     aligned: float = 0.05
     """rad; sides that differ by less in direction are parallel."""
-    coincidence: float = 0.004
+    coincidence: float = scaled(0.004)
     """m; lines, or axes, that are no further apart are the same."""
-    gap: float = 0.02
+    gap: float = scaled(0.02)
     """m; parts that are further apart do not touch."""
 
 
@@ -714,6 +747,31 @@ class RefinementOptions:
     """Joint fits of all candidates once duplicates are gone."""
     converged: float = 0.002
     """m, rad; rounds end where no parameter moves by more."""
+
+    def at_scale(self, factor: float) -> RefinementOptions:
+        """Return the numbers for things that are so many times as large, in cells that are.
+
+        Args:
+            factor: The side of a cell over 1 cm.
+
+        Returns:
+            The numbers.
+        """
+        return self if factor == 1 else _at_scale(self, factor)
+
+
+def _at_scale(options: Any, factor: float) -> Any:
+    """Return options, and those in them, with all lengths multiplied that are marked, and all blurs of descents."""
+    changed: dict[str, Any] = {}
+    for one in fields(options):
+        value = getattr(options, one.name)
+        if isinstance(value, Descent):
+            changed[one.name] = replace(value, blurs=tuple(factor * blur for blur in value.blurs))
+        elif is_dataclass(value):
+            changed[one.name] = _at_scale(value, factor)
+        elif SCALED in one.metadata:
+            changed[one.name] = factor * value
+    return replace(options, **changed)
 
 
 DEFAULTS = RefinementOptions()

@@ -122,7 +122,7 @@ def _templates(
     options, evidence = candidate.options, rated[0][0]
     primitives = [primitive_of(fit.kind, fit.p) for _, fit in rated]
     found = []
-    for fit in fit_templates(primitives, evidence, bundle, sensor, options.evidence.max_extent, options.templates):
+    for fit in fit_templates(primitives, evidence, bundle, sensor, options.evidence, options.templates):
         log_odds = fit.log_evidence - evidence - options.other.template_handicap
         reason = f"{fit.name} explains its rays better by {log_odds:.0f} nats"
         found.append(Alternative(fit.vertices, log_odds, fit.std, reason))

@@ -22,7 +22,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from detect.detection import Detection, Detections, Rejection, SensorErrors, UnknownObject
-from detect.refinement.candidates import Candidate, find_backgrounds, fit_candidates
+from detect.refinement.candidates import Candidate, by_level, find_backgrounds, fit_candidates
 from detect.refinement.fitting.evidence import compare_kinds
 from detect.refinement.likelihood.geometry import parameters_of, ranges_to
 from detect.refinement.likelihood.kernels import BACKGROUND, OCCLUSION
@@ -40,6 +40,7 @@ from detect.refinement.other import (
 )
 from detect.refinement.scanner_errors import correct_scanner_errors, settle_scanner_errors, with_shared_errors
 from detect.refinement.sensor_estimation import estimate_dropouts, estimate_noise, estimate_sensor, initial_noise
+from detect.refinement.surroundings.levels import MapLevel, MapLevels
 from detect.refinement.surroundings.map_cells import MapCells
 from detect.refinement.surroundings.proposals import propose
 from detect.refinement.touching import Site, Trial, find_sites, separate_touching
@@ -146,7 +147,7 @@ def refine_detections(
     threads: int = 2,
     effort: Effort = THOROUGH,
     options: RefinementOptions = DEFAULTS,
-    cells: MapCells | None = None,
+    levels: MapLevels | None = None,
 ) -> tuple[Detections, float | None]:
     """Refine a map's detections, and find what the networks missed.
 
@@ -158,25 +159,24 @@ def refine_detections(
         threads: How many are used; results do not depend on it.
         effort: How thoroughly.
         options: Numeric parameters.
-        cells: Those of the map, where they are known already.
+        levels: The map at several sizes of its cells, where that is made already, with the same options.
 
     Returns:
         What the rays support, likeliest kinds first, and what they do not, with the reasons; and the noise (m), None
         where nothing is supported.
     """
-    cells = cells or MapCells.of(grid, options.map, options.lines)
-    wanted, undecided = _candidates_of(detections, cells, effort, options)
-    found = len(detections.found)
+    levels = levels or MapLevels.of(grid, options)
+    wanted, undecided = _candidates_of(detections, levels, effort)
+    found = len(detections.found) + len(detections.rivals)
     warm_start = effort.warm_start
     known = _known_before(wanted, warm_start.detections, options.acceptance) if warm_start else {}
     starts = [known.get(number, detection).primitive for number, detection in enumerate(wanted)]
     refinement = Refinement(
-        cells,
+        levels,
         noise_std,
         threads,
         guessed_noise=warm_start.noise_std if warm_start else None,
         rounds=effort.rounds,
-        options=options,
     )
     refined = refinement.run(starts, scans, known, found, [detection.since for detection in wanted])
     kept: list[Detection] = []
@@ -188,6 +188,7 @@ def refine_detections(
         if number < found:
             reason = rejection_reason(result, options.acceptance)
         else:
+            cells = levels.showing(guess.primitive).cells
             reason = proposal_rejection_reason(result, guess.primitive, cells, options.acceptance)
         if result is None or reason:
             rejected.append(_rejection(guess, result, reason))
@@ -195,7 +196,8 @@ def refine_detections(
             objects.append(object_of(result, guess.since))
         else:
             kept.append(detection_of(result, guess))
-    judged = {id(rejection) for doubtful, rejection in detections.doubtful if id(doubtful) in undecided}
+    tried = [*detections.rivals, *(pair for pair in detections.doubtful if id(pair[0]) in undecided)]
+    judged = {id(rejection) for _, rejection in tried}
     rejected += [rejection for rejection in detections.rejected if id(rejection) not in judged]
     kept.sort(key=lambda detection: -detection.score)
     rejected.sort(key=lambda rejection: -rejection.score)
@@ -205,18 +207,19 @@ def refine_detections(
 
 
 def _candidates_of(
-    detections: Detections, cells: MapCells, effort: Effort, options: RefinementOptions
+    detections: Detections, levels: MapLevels, effort: Effort
 ) -> tuple[list[Detection], set[int]]:
     """Return what is to be refined, detections first, and the ids of proposals and detections of low score."""
     warm_start = effort.warm_start
     if warm_start:
-        unsure = _missing(warm_start.detections, detections, options.acceptance)
+        unsure = _missing(warm_start.detections, detections, levels.options.acceptance)
     else:
         unsure = [doubtful for doubtful, _ in detections.doubtful]
-    unsure = [detection for detection in unsure if not cells.hides_centroid(detection.primitive)]
-    known = [detection.primitive for detection in (*detections.found, *unsure)]
-    proposed = [] if warm_start else propose(cells, known, effort.max_proposals, options.proposals)
-    wanted = [*detections.found, *unsure, *(_without_score(primitive, effort.since) for primitive in proposed)]
+    unsure = [one for one in unsure if not levels.showing(one.primitive).cells.hides_centroid(one.primitive)]
+    detected = [*detections.found, *(rival for rival, _ in detections.rivals)]
+    known = [detection.primitive for detection in (*detected, *unsure)]
+    proposed = [] if warm_start else propose(levels, known, effort.max_proposals)
+    wanted = [*detected, *unsure, *(_without_score(primitive, effort.since) for primitive in proposed)]
     return wanted, {id(detection) for detection in unsure}
 
 
@@ -361,26 +364,29 @@ class Refinement:
     """Fits primitives to the rays of the scans that a map was made of.
 
     Attributes:
-        cells: The map.
+        levels: The map at several sizes of its cells, with the numeric parameters.
         noise_std: The range noise (m): known, or estimated by :meth:`run`.
         threads: How many are used.
         guessed_noise: A first guess (m) of the noise, where there is one.
         rounds: Joint fits once duplicates are gone; None: as in the options.
-        options: Numeric parameters.
         sensor: Errors of the scanner that :meth:`run` found and corrected; None where it found none.
         further: Of things that were separated by :meth:`run`, those beyond the guesses: with the index of the guess
             that they were a part of.
     """
 
-    cells: MapCells
+    levels: MapLevels
     noise_std: float | None = None
     threads: int = 2
     guessed_noise: float | None = None
     rounds: int | None = None
-    options: RefinementOptions = field(default_factory=RefinementOptions)
     sensor: SensorErrors | None = None
     further: list[tuple[int, RefinedPrimitive]] = field(default_factory=list)
     _separated: list[Trial] = field(default_factory=list)
+
+    @property
+    def options(self) -> RefinementOptions:
+        """Numeric parameters, at a scale of 1."""
+        return self.levels.options
 
     def run(
         self,
@@ -406,28 +412,39 @@ class Refinement:
         """
         if not primitives:
             return []
-        sites = [] if self.options.closed_world else find_sites(self.cells, primitives, self.options)
+        shown = [self.levels.showing(primitive) for primitive in primitives]
+        sites = [] if self.options.closed_world else self._find_sites(primitives, shown)
         alone = [site for site in sites if site.covered_by is None]
         circles = [site.circle for site in alone]
         stamps = list(since or [None] * len(primitives))
         stamps += [stamps[site.members[0]] for site in alone]
-        reach = self.options.rays.reach
-        bundles, span, max_noise = collect_rays(scans, [*primitives, *circles], reach, self.options, stamps)
+        reaches = [level.options.rays.reach for level in shown]
+        reaches += [reaches[site.members[0]] for site in alone]
+        bundles, span, max_noise = collect_rays(scans, [*primitives, *circles], reaches, self.options, stamps)
         for site, bundle in zip(alone, bundles[len(primitives) :], strict=True):
             site.bundle = bundle
         detections = known or {}
         candidates = [
-            Candidate(start, bundle, self.cells, detections.get(number), self.options)
-            for number, (start, bundle) in enumerate(zip(primitives, bundles, strict=False))
+            Candidate(start, bundle, level.cells, detections.get(number), level.options)
+            for number, (start, bundle, level) in enumerate(zip(primitives, bundles, shown, strict=False))
         ]
         for site in sites:
             site.take(candidates)
-        seen = [candidate for candidate in candidates if len(candidate.bundle)]
+        seen = [candidate for candidate in candidates if len(candidate.bundle) and not candidate.holds_laser()]
         results: dict[int, RefinedPrimitive | None] = {}
         if seen:
             with ThreadPoolExecutor(self.threads) as pool:
                 results = self._refine(pool, seen, candidates[:preferred], sites, span, max_noise)
         return self._in_order(candidates, results)
+
+    def _find_sites(self, primitives: Sequence[Primitive], shown: Sequence[MapLevel]) -> list[Site]:
+        """Find the components that guesses stand in, each in the cells that show it."""
+        sites = []
+        for level in self.levels:
+            members = [number for number, one in enumerate(shown) if one is level]
+            if members:
+                sites += find_sites(level.cells, primitives, members, level.options)
+        return sites
 
     def _in_order(
         self, candidates: Sequence[Candidate], results: Mapping[int, RefinedPrimitive | None]
@@ -458,7 +475,7 @@ class Refinement:
         """Search, remove duplicates, fit jointly, estimate the sensor, and compare kinds; results by id."""
         options, known_noise = self.options, self.noise_std
         noise = known_noise or min(self.guessed_noise or initial_noise(seen, options.sensor), max_noise)
-        find_backgrounds(pool, seen, self.cells, options.map.cleared_first, options)
+        find_backgrounds(pool, seen, is_first=True)
         dropouts = estimate_dropouts(seen, noise, options.sensor)
         sensor = BeamModel.create(noise, span, max_std=max_noise, options=options.sensor, dropout_share=dropouts)
         fit_candidates(pool, seen, [True] * len(seen), sensor)
@@ -473,8 +490,8 @@ class Refinement:
         disperses = sensor.dispersion > options.sensor.significant_dispersion
         fit_candidates(pool, single, [disperses] * len(single), sensor)
         self.noise_std = sensor.std
-        whole_map = DistanceMap.of(self.cells.occupied, self.cells.frame)
-        finished = pool.map(lambda item: finish(item, whole_map.background(item.bundle), sensor), single)
+        maps = {id(part[0].cells): DistanceMap.of(part[0].cells.occupied, part[0].cells.frame) for part in by_level(single)}
+        finished = pool.map(lambda one: finish(one, maps[id(one.cells)].background(one.bundle), sensor), single)
         results = {id(candidate): result for candidate, result in zip(single, finished, strict=True)}
         return results if options.closed_world else self._beside_others(pool, single, results, sensor)
 
@@ -548,14 +565,14 @@ class Refinement:
     def _near_rays(self, candidates: list[Candidate]) -> list[Candidate]:
         """Leave out rays that pass far from the fits, and candidates without any."""
         for candidate in candidates:
-            candidate.keep_rays(candidate.bundle.passing(candidate.current, self.options.rays.fitted_reach))
+            candidate.keep_rays(candidate.bundle.passing(candidate.current, candidate.options.rays.fitted_reach))
         return [candidate for candidate in candidates if len(candidate.bundle)]
 
     def _fit_jointly(self, pool: Executor, candidates: list[Candidate], sensor: BeamModel) -> None:
         """Fit all in rounds, each beside what the others were in the round before, until none moves."""
         for _ in range(self.options.rounds if self.rounds is None else self.rounds):
             before = [parameters_of(candidate.current) for candidate in candidates]
-            changed = find_backgrounds(pool, candidates, self.cells, self.options.map.cleared, self.options)
+            changed = find_backgrounds(pool, candidates)
             fit_candidates(pool, candidates, changed, sensor)
             now = [parameters_of(candidate.current) for candidate in candidates]
             moved = (np.abs(p - at).max() for p, at in zip(now, before, strict=True))

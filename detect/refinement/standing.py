@@ -23,10 +23,10 @@ from detect.refinement.likelihood.geometry import parameters_of, primitive_of
 from detect.refinement.likelihood.kernels import BACKGROUND
 from detect.refinement.likelihood.rays import collect_rays
 from detect.refinement.likelihood.sensor_model import BeamModel
-from detect.refinement.options import DEFAULTS, RefinementOptions, StandingOptions
+from detect.refinement.options import DEFAULTS, StandingOptions
 from detect.refinement.scanner_errors import errors_of
 from detect.refinement.sensor_estimation import estimate_dropouts
-from detect.refinement.surroundings.map_cells import MapCells
+from detect.refinement.surroundings.levels import MapLevels
 from prim.scan import Scan
 from prim.se2 import Pose2D
 from prim.shapes import Primitive, angle_error
@@ -63,11 +63,11 @@ class Judgement:
 def judge_places(
     detections: Sequence[Detection],
     scans: Iterable[tuple[Scan, Pose2D]],
-    cells: MapCells,
+    levels: MapLevels,
     noise_std: float,
     threads: int,
     slack: float = 0.0,
-    options: RefinementOptions = DEFAULTS,
+    limits: StandingOptions = DEFAULTS.standing,
     sensor_errors: SensorErrors | None = None,
 ) -> list[Judgement]:
     """Judge whether primitives stand, in some scans, where they were fitted.
@@ -75,11 +75,11 @@ def judge_places(
     Args:
         detections: The fitted primitives.
         scans: The scans, with the laser's poses.
-        cells: Those of the map that shows what is behind the primitives.
+        levels: The map that shows what is behind the primitives.
         noise_std: Range noise (m).
         threads: How many are used.
         slack: What the poses' errors alone may displace a primitive by (m).
-        options: Numeric parameters.
+        limits: When a primitive is gone, or was moved.
         sensor_errors: Errors of the scanner that were corrected where they were fitted.
 
     Returns:
@@ -88,24 +88,29 @@ def judge_places(
     if not detections:
         return []
     primitives = [detection.primitive for detection in detections]
-    bundles, span, max_noise = collect_rays(scans, primitives, options.rays.fitted_reach, options)
+    options, errors = levels.options, errors_of(sensor_errors)
+    shown = [levels.showing(primitive) for primitive in primitives]
+    reaches = [level.options.rays.fitted_reach for level in shown]
+    bundles, span, max_noise = collect_rays(scans, primitives, reaches, options)
     candidates = [
-        Candidate(detection.primitive, bundle, cells, detection, options, errors=errors_of(sensor_errors))
-        for detection, bundle in zip(detections, bundles, strict=True)
+        Candidate(detection.primitive, bundle, level.cells, detection, level.options, errors=errors)
+        for detection, bundle, level in zip(detections, bundles, shown, strict=True)
     ]
     with ThreadPoolExecutor(threads) as pool:
-        find_backgrounds(pool, candidates, cells, options.map.cleared, options)
+        find_backgrounds(pool, candidates)
         dropouts = estimate_dropouts(candidates, noise_std, options.sensor)
         sensor = BeamModel.create(noise_std, span or 1.0, 0.0, 1.0, max_noise, options.sensor, dropouts)
-        return list(pool.map(lambda candidate: _judge(candidate, candidates, sensor, slack), candidates))
+        return list(pool.map(lambda candidate: _judge(candidate, candidates, sensor, slack, limits), candidates))
 
 
-def _judge(candidate: Candidate, candidates: Sequence[Candidate], sensor: BeamModel, slack: float) -> Judgement:
+def _judge(
+    candidate: Candidate, candidates: Sequence[Candidate], sensor: BeamModel, slack: float, limits: StandingOptions
+) -> Judgement:
     """Judge one primitive beside the others."""
     start = candidate.start
     if not len(candidate.bundle):
         return Judgement(Verdict.STANDS, start)
-    limits, kind, p = candidate.options.standing, start.kind, parameters_of(start)
+    kind, p = start.kind, parameters_of(start)
     bundle = candidate.rays_with_background(candidates, sensor)
     (fit,) = refit_same_kind(candidate.known_fit, bundle, sensor, candidate.options.fit)
     here, there = exact_costs(kind, np.stack([p, fit.p]), bundle, sensor, candidate.options.evidence).tolist()

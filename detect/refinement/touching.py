@@ -15,7 +15,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from detect.refinement.candidates import Candidate, fit_candidates
+from detect.refinement.candidates import Candidate, by_level, fit_candidates, without_candidates
 from detect.refinement.fitting.evidence import exact_costs, laplace_evidence
 from detect.refinement.likelihood.geometry import ranges_to
 from detect.refinement.likelihood.kernels import BACKGROUND, OCCLUSION
@@ -60,12 +60,18 @@ class Site:
             self.bundle = candidates[self.covered_by].bundle
 
 
-def find_sites(cells: MapCells, guesses: Sequence[Primitive], options: RefinementOptions = DEFAULTS) -> list[Site]:
+def find_sites(
+    cells: MapCells,
+    guesses: Sequence[Primitive],
+    numbers: Sequence[int] | None = None,
+    options: RefinementOptions = DEFAULTS,
+) -> list[Site]:
     """Find the components that guesses stand in.
 
     Args:
         cells: The map.
         guesses: The guesses.
+        numbers: Which of them; None: all.
         options: Numeric parameters.
 
     Returns:
@@ -75,7 +81,8 @@ def find_sites(cells: MapCells, guesses: Sequence[Primitive], options: Refinemen
     sizes = np.bincount(labels.ravel())
     largest = math.pi * (options.touching.max_radius / cells.frame.resolution + 1) ** 2
     members: dict[int, list[int]] = {}
-    for number, guess in enumerate(guesses):
+    for number in range(len(guesses)) if numbers is None else numbers:
+        guess = guesses[number]
         rows, cols, points = cells.around(guess, guess.bounding_radius)
         own = labels[rows, cols][is_within(guess, points, 0.0)]
         counts = np.bincount(own[own > 0])
@@ -168,12 +175,14 @@ def separate_touching(
     options = candidates[0].options
     taken = {id(one) for trial in trials for one in trial.before}
     beside = [candidate for candidate in candidates if id(candidate) not in taken]
-    _set_backgrounds(pool, trials, beside, options)
+    for part in by_level([trial.whole for trial in trials]):
+        own = [trial for trial in trials if trial.whole.cells is part[0].cells]
+        _set_backgrounds(pool, own, beside)
     list(pool.map(lambda trial: _cut(trial, beside, sensor), trials))
     for _ in range(options.touching.tries):
         sure = options.touching.sure_nats
         tried = [trial for trial in trials if trial.partitions and trial.evidence < trial.alone + sure]
-        _fit_parts(pool, tried, beside, sensor, options)
+        _fit_parts(pool, tried, beside, sensor)
         for trial in tried:
             _judge(pool, trial, beside, sensor)
     found = [trial for trial in trials if trial.parts]
@@ -205,12 +214,10 @@ def _whole(site: Site, before: Sequence[Candidate]) -> Candidate:
     return made
 
 
-def _set_backgrounds(
-    pool: Executor, trials: Sequence[Trial], beside: Sequence[Candidate], options: RefinementOptions
-) -> None:
-    """Read from the map what stands behind sites: nothing of their own cells."""
+def _set_backgrounds(pool: Executor, trials: Sequence[Trial], beside: Sequence[Candidate]) -> None:
+    """Read from one map what stands behind sites: nothing of their own cells."""
     cells = trials[0].whole.cells
-    occupied = cells.without([candidate.current for candidate in beside], options.map.cleared)
+    occupied = without_candidates(cells, beside).copy()
     for trial in trials:
         occupied[trial.site.cells] = False
         for wall in trial.whole.walls:
@@ -268,21 +275,16 @@ def _are_alike(a: Partition, b: Partition, options: TouchingOptions) -> bool:
     return all(max(polygon_iou(one, other) for other in b.guesses) > options.alike for one in a.guesses)
 
 
-def _fit_parts(
-    pool: Executor,
-    trials: Sequence[Trial],
-    beside: Sequence[Candidate],
-    sensor: BeamModel,
-    options: RefinementOptions,
-) -> None:
+def _fit_parts(pool: Executor, trials: Sequence[Trial], beside: Sequence[Candidate], sensor: BeamModel) -> None:
     """Fit the parts of each trial's next partition beside each other."""
     for trial in trials:
         guesses = trial.partitions.pop(0).guesses
-        trial.tried = [_part(guess, trial.whole, options.rays.reach) for guess in guesses]
+        trial.tried = [_part(guess, trial.whole, trial.whole.options.rays.reach) for guess in guesses]
     parts = [part for trial in trials for part in trial.tried]
-    for left in reversed(range(options.touching.rounds)):
+    rounds = parts[0].options.touching.rounds if parts else 0
+    for left in reversed(range(rounds)):
         for part in parts if not left else []:
-            part.keep_rays(part.bundle.passing(part.current, options.rays.fitted_reach))
+            part.keep_rays(part.bundle.passing(part.current, part.options.rays.fitted_reach))
         fit_candidates(pool, parts, [left > 0] * len(parts), sensor, beside)
 
 

@@ -13,10 +13,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from detect.detection import Detection, SensorErrors
-from detect.refinement.options import DEFAULTS as REFINEMENT
-from detect.refinement.options import RefinementOptions, StandingOptions
+from detect.refinement.options import StandingOptions
 from detect.refinement.standing import Verdict, judge_places
-from detect.refinement.surroundings.map_cells import MapCells
+from detect.refinement.surroundings.levels import MapLevels
 from prim.arrays import FloatArray
 from prim.scan import Scan
 from prim.se2 import Pose2D, angle_difference
@@ -47,10 +46,9 @@ DEFAULTS = MixedOptions()
 def add_disagreement(
     detection: Detection,
     scans: Sequence[tuple[Scan, Pose2D]],
-    cells: MapCells,
+    levels: MapLevels,
     noise_std: float,
     slack: float = 0.0,
-    refinement: RefinementOptions = REFINEMENT,
     options: MixedOptions = DEFAULTS,
     sensor_errors: SensorErrors | None = None,
 ) -> Detection:
@@ -59,10 +57,9 @@ def add_disagreement(
     Args:
         detection: The refined primitive.
         scans: The pieces of scans, in the order of time; those since ``detection.since`` count.
-        cells: Those of the map that shows what is behind the primitive.
+        levels: The map that shows what is behind the primitive.
         noise_std: Range noise (m).
         slack: What the poses' errors alone may displace it by (m).
-        refinement: Numeric parameters of the fits.
         options: Those of the judgement.
         sensor_errors: Errors of the scanner that were corrected where it was fitted.
 
@@ -74,11 +71,10 @@ def add_disagreement(
     part = [piece for piece in scans if detection.since is None or piece[0].stamp >= detection.since]
     reach = options.max_displacement * detection.primitive.bounding_radius
     limits = StandingOptions(min_gain=options.min_gain, min_displacement=options.min_displacement)
-    refinement = replace(refinement, standing=limits)
     displacements = []
     while len(part) // 2 >= options.min_scans:
         part = part[len(part) // 2 :]
-        (judgement,) = judge_places([detection], part, cells, noise_std, cores(), slack, refinement, sensor_errors)
+        (judgement,) = judge_places([detection], part, levels, noise_std, cores(), slack, limits, sensor_errors)
         displacement = _displacement(detection.primitive, judgement.nearby)
         if judgement.verdict is Verdict.MOVED and _length(displacement) < reach:
             displacements.append(displacement)

@@ -22,7 +22,7 @@ from detect.refinement.options import DEFAULTS as REFINEMENT
 from detect.refinement.options import RefinementOptions
 from detect.refinement.refine import Effort, WarmStart, refine_detections
 from detect.refinement.standing import Judgement, Verdict, judge_places
-from detect.refinement.surroundings.map_cells import MapCells
+from detect.refinement.surroundings.levels import MapLevels
 from mapping.grid import UNKNOWN, OccupancyGrid
 from prim.metrics import outline_overlap, overlap_coefficient
 from prim.scan import Scan
@@ -64,7 +64,7 @@ class Look:
     Attributes:
         detections: What was refined by all scans so far.
         grid: Their map.
-        cells: The map's cells as refinement takes them.
+        levels: The map as refinement takes it.
         noise_std: The range noise (m).
         recent: The pieces of the recent scans.
         scans: The pieces of a subset of all scans.
@@ -72,7 +72,7 @@ class Look:
 
     detections: Detections
     grid: OccupancyGrid
-    cells: MapCells
+    levels: MapLevels
     noise_std: float
     recent: Pieces
     scans: Pieces
@@ -124,7 +124,7 @@ class MovedPrimitives:
             The detections as the recent scans have them; the same ones where these contradict nothing.
         """
         found, self._sensor_errors = look.detections.found, look.detections.sensor
-        judged = self._judge(found, look.recent, look.cells, look.noise_std)
+        judged = self._judge(found, look.recent, look.levels, look.noise_std)
         stands = [d for d, judgement in zip(found, judged, strict=True) if judgement.verdict is Verdict.STANDS]
         self._moved = tuple(moved for moved in self._moved if not self._stood_always(moved, stands, look))
         if not (self._has_lost(found) or self._moved) and len(stands) == len(found):
@@ -141,10 +141,9 @@ class MovedPrimitives:
             add_disagreement(
                 detection,
                 pieces,
-                look.cells,
+                look.levels,
                 look.noise_std,
                 self._slack,
-                self._refinement,
                 sensor_errors=look.detections.sensor,
             )
             for detection in (*kept, *self._moved)
@@ -177,7 +176,7 @@ class MovedPrimitives:
                 return False
             older = [piece for piece in look.scans if piece[0].stamp < since]
             earliest = older[: max(len(older) // 6, 1)]  # later ones may have come after it did
-            (judgement,) = self._judge([detection], earliest, look.cells, look.noise_std)
+            (judgement,) = self._judge([detection], earliest, look.levels, look.noise_std)
             is_known = judgement.is_seen or judgement.verdict is Verdict.MOVED
             return is_known and not self._is_away(detection, judgement)
 
@@ -201,7 +200,7 @@ class MovedPrimitives:
         since = moved.since or look.since
         older = [piece for piece in look.scans if piece[0].stamp < since]
         later = [piece for piece in look.scans if piece[0].stamp >= since]
-        before, after = (self._judge(rivals, scans, look.cells, look.noise_std) for scans in (older, later))
+        before, after = (self._judge(rivals, scans, look.levels, look.noise_std) for scans in (older, later))
         return any(first.is_seen and second.is_seen for first, second in zip(before, after, strict=True))
 
     def _refine_moved(
@@ -223,29 +222,29 @@ class MovedPrimitives:
         new = _since(self._without_overlaps([*recent, *nearby], self._moved), look.since).found
         pieces = scans if self._moved else look.recent
         refined = self._refine([*self._moved, *new], look, grid, pieces, effort)
-        cells = MapCells.of(grid)
-        again = self._judge(refined, look.recent, cells, look.noise_std)
+        levels = MapLevels.of(grid, self._refinement)
+        again = self._judge(refined, look.recent, levels, look.noise_std)
         contradicted = [judgement.verdict is not Verdict.STANDS for judgement in again]
         lost = [d.since != look.since and wrong for d, wrong in zip(refined, contradicted, strict=True)]
         if any(lost):
             kept = [d for d, away in zip(refined, lost, strict=True) if not away]
             new = _since(self._without_overlaps([*recent, *_moved_nearby(refined, again)], kept), look.since).found
             refined = self._refine([*kept, *new], look, grid, pieces, effort)
-        refined += self._still_standing(refined, look, cells)
+        refined += self._still_standing(refined, look, levels)
         known = [d for d in stands if not self._shares(d, self._moved)]
         arrived = [d for d in refined if not self._shares(d, known)]
-        return tuple(arrived if self._moved else self._not_there_before(arrived, look, cells))
+        return tuple(arrived if self._moved else self._not_there_before(arrived, look, levels))
 
-    def _still_standing(self, refined: Sequence[Detection], look: Look, cells: MapCells) -> list[Detection]:
+    def _still_standing(self, refined: Sequence[Detection], look: Look, levels: MapLevels) -> list[Detection]:
         """Return what moved before and is too little seen now to be refined, as it was, if nothing contradicts it."""
         unseen = self._without_overlaps(self._moved, refined)
-        judged = self._judge(unseen, look.recent, cells, look.noise_std)
+        judged = self._judge(unseen, look.recent, levels, look.noise_std)
         return [d for d, judgement in zip(unseen, judged, strict=True) if judgement.verdict is Verdict.STANDS]
 
-    def _not_there_before(self, arrived: list[Detection], look: Look, cells: MapCells) -> list[Detection]:
+    def _not_there_before(self, arrived: list[Detection], look: Look, levels: MapLevels) -> list[Detection]:
         """Return those that the scans before the recent ones contradict."""
         older = [piece for piece in look.scans if piece[0].stamp < look.since]
-        judged = self._judge(arrived, older, cells, look.noise_std)
+        judged = self._judge(arrived, older, levels, look.noise_std)
         return [d for d, judgement in zip(arrived, judged, strict=True) if judgement.verdict is not Verdict.STANDS]
 
     def _refine(
@@ -259,10 +258,10 @@ class MovedPrimitives:
         return list(refined.found)
 
     def _judge(
-        self, detections: Sequence[Detection], scans: Pieces, cells: MapCells, noise_std: float
+        self, detections: Sequence[Detection], scans: Pieces, levels: MapLevels, noise_std: float
     ) -> list[Judgement]:
-        errors = self._sensor_errors
-        return judge_places(detections, scans, cells, noise_std, cores(), self._slack, self._refinement, errors)
+        limits, errors = self._refinement.standing, self._sensor_errors
+        return judge_places(detections, scans, levels, noise_std, cores(), self._slack, limits, errors)
 
     def _without_overlaps(self, detections: Sequence[Detection], others: Sequence[Detection]) -> list[Detection]:
         """Return those that overlap none of some others, and none before them."""

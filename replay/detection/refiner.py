@@ -20,7 +20,7 @@ from prim.threads import cores
 if TYPE_CHECKING:
     from detect.detection import Detection, Detections, UnknownObject
     from detect.refinement.refine import Effort
-    from detect.refinement.surroundings.map_cells import MapCells
+    from detect.refinement.surroundings.levels import MapLevels
     from replay.detection.moved_primitives import MovedPrimitives
 
 
@@ -182,7 +182,7 @@ class DetectionRefiner:
             The refined detections and the range noise (m), None where no ray passes any of them.
         """
         from detect.refinement.refine import Effort, WarmStart
-        from detect.refinement.surroundings.map_cells import MapCells
+        from detect.refinement.surroundings.levels import MapLevels
 
         search_kinds = self._scans.total >= self._options.kind_search_growth * self._kind_search_at
         if search_kinds:
@@ -190,11 +190,11 @@ class DetectionRefiner:
         proposals = self._options.proposals if self._scans.total >= self._options.proposals_from else 0
         warm_start = None if search_kinds or self._previous is None else WarmStart(*self._previous)
         effort = Effort(warm_start, proposals, rounds=0)
-        cells = MapCells.of(grid)
-        self._previous = self._refine(detections, grid, cells, self._scans.pieces(), effort)
+        levels = MapLevels.of(grid, self._refinement)
+        self._previous = self._refine(detections, grid, levels, self._scans.pieces(), effort)
         refined, noise_std = self._previous
         stands = WarmStart(refined, noise_std)
-        refined = self._correct(refined, grid, cells, noise_std, self._scans.pieces, Effort(stands, rounds=0))
+        refined = self._correct(refined, grid, levels, noise_std, self._scans.pieces, Effort(stands, rounds=0))
         self._recent.end_look()
         return self._with_frame_uncertainty(refined), noise_std
 
@@ -215,18 +215,18 @@ class DetectionRefiner:
             The refined detections and the range noise (m), None where no ray passes any of them.
         """
         from detect.refinement.refine import THOROUGH
-        from detect.refinement.surroundings.map_cells import MapCells
+        from detect.refinement.surroundings.levels import MapLevels
 
-        cells = MapCells.of(grid)
-        refined, noise_std = self._refine(detections, grid, cells, scans(), THOROUGH)
-        refined = self._correct(refined, grid, cells, noise_std, scans, THOROUGH)
+        levels = MapLevels.of(grid, self._refinement)
+        refined, noise_std = self._refine(detections, grid, levels, scans(), THOROUGH)
+        refined = self._correct(refined, grid, levels, noise_std, scans, THOROUGH)
         return self._with_frame_uncertainty(refined), noise_std
 
     def _correct(
         self,
         detections: Detections,
         grid: OccupancyGrid,
-        cells: MapCells,
+        levels: MapLevels,
         noise_std: float | None,
         scans: Callable[[], Iterable[tuple[Scan, Pose2D]]],
         effort: Effort,
@@ -238,14 +238,14 @@ class DetectionRefiner:
         from replay.detection.moved_primitives import Look
 
         return self._moved.correct(
-            Look(detections, grid, cells, noise_std, recent, self._scans.pieces()), scans, effort
+            Look(detections, grid, levels, noise_std, recent, self._scans.pieces()), scans, effort
         )
 
     def _refine(
         self,
         detections: Detections,
         grid: OccupancyGrid,
-        cells: MapCells,
+        levels: MapLevels,
         scans: Iterable[tuple[Scan, Pose2D]],
         effort: Effort,
     ) -> tuple[Detections, float | None]:
@@ -253,7 +253,7 @@ class DetectionRefiner:
         from detect.refinement.refine import refine_detections
 
         return refine_detections(
-            detections, scans, grid, self._noise_std, cores(), effort, self._refinement, cells=cells
+            detections, scans, grid, self._noise_std, cores(), effort, self._refinement, levels=levels
         )
 
     def _with_frame_uncertainty(self, detections: Detections) -> Detections:

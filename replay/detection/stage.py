@@ -8,11 +8,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-import numpy as np
-
 from detect.networks.weights import WeightsError, shipped_weights
 from mapping.grid import GridFrame, OccupancyGrid
 from mapping.mapper import Mapper, make_mapper, takes_noise
+from mapping.pyramid import FEWEST_CELLS, ROUNDING
 from prim.choices import SensorModelName
 from prim.errors import UsageError
 from prim.metrics import DetectionErrors, detection_errors
@@ -32,6 +31,11 @@ if TYPE_CHECKING:
     from detect.detector import Detector
     from detect.tracker import Tracker
     from replay.detection.moved_primitives import MovedPrimitives
+
+
+FINE_CELLS = 4_000_000
+"""A map of its own, in finer cells than the replay's, is made for detection where it has no more cells: those of 20 x
+20 m at 1 cm. Set by hand."""
 
 
 @dataclass(frozen=True)
@@ -102,8 +106,9 @@ class DetectionStage:
     ) -> None:
         self._detector = detector
         self._posed_scans = posed_scans
-        self._own_mapper = _own_mapper(detector, options, frame)
-        cells = math.prod(GridFrame.covering(frame.bounds, detector.card.resolution).shape)
+        self._sizes = options.sizes
+        self._own_mapper = _own_mapper(options, frame)
+        cells = math.prod(GridFrame.covering(frame.bounds, _resolution(options, frame)).shape)
         interval = detection_interval(options, len(posed_scans.scan_log), cells, is_shown)
         self._interval, self.note = interval.scans, interval.note
         self._refiner = self._make_refiner(options, frame) if options.refine else None
@@ -139,7 +144,7 @@ class DetectionStage:
             if not self._is_due(posed.position):
                 return None
             grid = (self._own_mapper or mapper).grid()
-            detections = self._detector.detect(grid)
+            detections = self._detector.detect(grid, self._sizes)
         noise_std = None
         if self._refiner:
             with self._timer.stage("refine"):
@@ -162,7 +167,7 @@ class DetectionStage:
         with self._timer.stage("detect"):
             if self._own_mapper is not None:
                 grid = self._own_mapper.finish()
-            detections = self._detector.detect(grid)
+            detections = self._detector.detect(grid, self._sizes)
         noise_std = None
         if self._refiner:
             with self._timer.stage("refine"):
@@ -290,29 +295,44 @@ def _moved_primitives(
     from replay.detection.moved_primitives import MovedPrimitives  # as all that refinement needs
 
     def make_map(scans: Iterable[tuple[Scan, Pose2D]]) -> OccupancyGrid:
-        mapper = _detectors_mapper(detector, options, frame)
+        mapper = _detectors_mapper(options, frame)
         for scan, pose in scans:
             mapper.accumulate(scan, pose)
         return mapper.finish()
 
-    return MovedPrimitives(make_map, detector.detect, pose_std, refinement=options.refinement)
+    def detect(grid: OccupancyGrid) -> Detections:
+        return detector.detect(grid, options.sizes)
+
+    return MovedPrimitives(make_map, detect, pose_std, refinement=options.refinement)
 
 
 def _pieces(posed_scans: PosedScans) -> Iterator[tuple[Scan, Pose2D]]:
     return (piece for posed in posed_scans for piece in posed.pieces)
 
 
-def _own_mapper(detector: Detector, options: ReplayOptions, frame: GridFrame) -> Mapper | None:
-    """Make a mapper of the kind and the cells that the detector was trained on; None where the replay's has both."""
-    cell = detector.card.resolution
-    if np.isclose(options.resolution, cell, rtol=1e-6) and options.sensor_model == "eq4":
+def _resolution(options: ReplayOptions, frame: GridFrame) -> float:
+    """Return the side (m) of the cells that the detector sees: the replay's, or finer ones that small things need.
+
+    A large map is not made twice: there only what its own cells show is found.
+    """
+    needed = options.sizes[0] / FEWEST_CELLS
+    if options.resolution <= needed * (1 + ROUNDING):
+        return options.resolution
+    width, height = frame.cols * frame.resolution, frame.rows * frame.resolution
+    return needed if width * height / needed**2 <= FINE_CELLS else options.resolution
+
+
+def _own_mapper(options: ReplayOptions, frame: GridFrame) -> Mapper | None:
+    """Make a mapper whose cells show what is wanted, with the sensor model of training; None where the replay's does.
+    """
+    if _resolution(options, frame) == options.resolution and options.sensor_model == "eq4":
         return None
-    return _detectors_mapper(detector, options, frame)
+    return _detectors_mapper(options, frame)
 
 
-def _detectors_mapper(detector: Detector, options: ReplayOptions, frame: GridFrame) -> Mapper:
-    """Make a mapper of the kind and the cells that the detector was trained on."""
-    cell = detector.card.resolution
+def _detectors_mapper(options: ReplayOptions, frame: GridFrame) -> Mapper:
+    """Make a mapper of maps as the detector reads them."""
+    cell = _resolution(options, frame)
     model = SensorModelName.EQ4
     noise_std = options.noise_std if takes_noise(options.mapper, model) else None
     return make_mapper(options.mapper, cell, GridFrame.covering(frame.bounds, cell).bounds, model, noise_std)

@@ -2,7 +2,7 @@
 
 The evidence is the likelihood integrated over the prior: a square that explains the rays as well as a rectangle does
 is the likelier kind, since it has a size less to choose (Occam's factor; MacKay 2003, chapter 28). The prior is
-uniform over sizes and angles, equal for all kinds, and flat over positions, which cancels in ratios. Where scans have
+scale-free over sizes, uniform over angles, equal for all kinds, and flat over positions, which cancels in ratios. Where scans have
 common errors the log-likelihood is divided by the dispersion (a power likelihood; Bissiri, Holmes and Walker 2016).
 
 The evidence is first approximated by Laplace's method, and for the contenders computed by adaptive importance
@@ -44,35 +44,44 @@ POSITIVE = 1e-3
 """m; a sample with a smaller size is no shape."""
 
 
-def max_size(kind: Kind, options: EvidenceOptions = DEFAULTS.evidence) -> float:
-    """Return the upper bound (m) of a kind's sizes under the prior.
+def size_bounds(kind: Kind, options: EvidenceOptions = DEFAULTS.evidence) -> tuple[float, float]:
+    """Return the bounds (m) of a kind's sizes under the prior.
 
     Args:
         kind: The kind.
-        options: The largest extent.
+        options: The wanted sizes.
 
     Returns:
-        The bound (m): half the extent for radii and semi-axes.
+        The bounds (m): half of the extents' for radii and semi-axes.
     """
-    return options.max_extent / kind.extent
+    lower, upper = options.bounds
+    return lower / kind.extent, upper / kind.extent
 
 
-def log_prior(kind: Kind, options: EvidenceOptions = DEFAULTS.evidence) -> float:
+def log_prior(kind: Kind, sizes: FloatArray, options: EvidenceOptions = DEFAULTS.evidence) -> FloatArray:
     """Return the log of the prior density of a kind's angle and sizes.
 
-    Sizes are uniform up to :func:`max_size`, angles over the kind's period. Where the longer size is first by
-    definition, each shape has two names in the parameters' full range, of which one is found.
+    The logarithms of sizes are uniform (Jeffreys' prior of a scale) between the bounds that all wanted things allow,
+    angles over the kind's period. Where the longer size is first by definition, each shape has two names in the
+    parameters' full range, of which one is found.
 
     Args:
         kind: The kind.
-        options: The largest extent.
+        sizes: (..., S) its own sizes (m).
+        options: The wanted sizes.
 
     Returns:
-        Nats (for metres and radians).
+        (...) in nats (for metres and radians).
     """
-    sizes = len(kind.sizes) * math.log(kind.extent / options.max_extent)
     angle = 0.0 if kind.row.period is None else -math.log(kind.row.period)
-    return sizes + angle + (math.log(2) if kind.longer_first else 0.0)
+    names = math.log(2) if kind.longer_first else 0.0
+    densities = options.log_size_density - np.log(np.maximum(sizes, POSITIVE))
+    return np.asarray(densities.sum(axis=-1) + angle + names)
+
+
+def _own_sizes(kind: Kind, points: FloatArray) -> FloatArray:
+    """Return the sizes (..., S) among a kind's own parameters (..., K)."""
+    return points[..., -len(kind.sizes) :]
 
 
 def laplace_evidence(fit: KindFit, dispersion: float = 1.0, options: EvidenceOptions = DEFAULTS.evidence) -> float:
@@ -90,7 +99,9 @@ def laplace_evidence(fit: KindFit, dispersion: float = 1.0, options: EvidenceOpt
     """
     size = len(fit.information)
     volume = 0.5 * (size * math.log(2 * math.pi) - _log_determinant(fit.information / dispersion + np.eye(size)))
-    return float(-fit.cost / dispersion + volume + log_prior(fit.kind, options))
+    jacobian = JACOBIANS[fit.kind]
+    own = fit.p @ (jacobian / (jacobian**2).sum(axis=0))
+    return float(-fit.cost / dispersion + volume + log_prior(fit.kind, _own_sizes(fit.kind, own), options))
 
 
 def _log_determinant(matrix: FloatArray) -> float:
@@ -235,7 +246,7 @@ class Round:
         mean: (K,) of the proposal.
         lower: (K, K) the Cholesky factor of its covariance's scale.
         points: (N, K), by the centroid.
-        log_weight: (N,) log-likelihood over the proposal's density; -inf where there is no such shape.
+        log_weight: (N,) log of likelihood and prior over the proposal's density; -inf where there is no such shape.
     """
 
     split: SplitCost
@@ -284,6 +295,7 @@ def _draw_last_round(
         points = anchor.moved(drawn, 1.0)
         cost = split.costs(points @ jacobian.T)
         log_weight = -cost / sensor.dispersion - log_density + np.log(np.diag(lower)).sum()
+        log_weight += log_prior(fit.kind, _own_sizes(fit.kind, points), options)
         log_weight[~(np.isfinite(log_weight) & (np.abs(points) <= MAX_COORDINATE).all(axis=1))] = -math.inf
         if not np.isfinite(log_weight).any():
             return impossible
@@ -335,7 +347,7 @@ def _posteriors_of(rounds: Sequence[Round], sensor: BeamModel, options: Evidence
         part = weight * share
         least = options.min_effective_last * len(one.points)
         mean, covariance = _moments(points, _tempered(part, least, options))
-        log_evidence = float(log_weight.max() + np.log(part.mean())) + log_prior(kind, options)
+        log_evidence = float(log_weight.max() + np.log(part.mean()))
         cost = float(one.split.costs((JACOBIANS[kind] @ mean)[None])[0])
         covariance = covariance + np.diag(_floor(kind, options) ** 2) / 100
         posteriors.append(KindPosterior(mean, covariance, log_evidence, cost))
@@ -493,8 +505,8 @@ def exact_costs(
         (M,) in nats; infinite where a size is out of the prior's bounds.
     """
     out = np.empty(len(shapes))
-    sizes = shapes[:, 3:]
-    allowed = np.asarray(((sizes > POSITIVE) & (sizes < max_size(kind, options))).all(axis=1))
+    sizes, (lower, upper) = shapes[:, 3:], size_bounds(kind, options)
+    allowed = np.asarray(((sizes > lower) & (sizes < upper)).all(axis=1))
     safe = np.ascontiguousarray(np.where(allowed[:, None], shapes, shapes[np.argmax(allowed)]))
     numbers = np.full(len(shapes), NUMBERS[kind])
     negative_log_likelihoods(OUTLINES, numbers, safe, sensor.data(bundle), sensor.footprint, out)
@@ -540,7 +552,7 @@ def compare_kinds(
         The posterior, or None where no kind is left, all are larger than the prior allows, or none has a finite
         evidence.
     """
-    fits = [fit for fit in fits if (fit.p[3:] < max_size(fit.kind, options)).all()]
+    fits = [fit for fit in fits if (fit.p[3:] < size_bounds(fit.kind, options)[1]).all()]
     rated = [(laplace_evidence(fit, sensor.dispersion, options), fit) for fit in fits]
     rated = [(nats, fit) for nats, fit in rated if math.isfinite(nats)]
     if not rated:

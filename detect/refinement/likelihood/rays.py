@@ -220,7 +220,7 @@ def _measurements(scan: Scan) -> tuple[NDArray[np.int8], FloatArray]:
 def collect_rays(
     scans: Iterable[tuple[Scan, Pose2D]],
     primitives: Sequence[Primitive],
-    reach: float,
+    reach: float | Sequence[float],
     options: RefinementOptions = DEFAULTS,
     since: Sequence[int | None] | None = None,
 ) -> tuple[list[RayBundle], float, float]:
@@ -229,7 +229,7 @@ def collect_rays(
     Args:
         scans: Scans and the poses of their laser, in the map frame.
         primitives: The primitives.
-        reach: How near (m) to their circumscribed circles.
+        reach: How near (m) to their circumscribed circles; one number for all, or one for each.
         options: The limits.
         since: The stamp (ns) for each from which on scans are used; None for all.
 
@@ -237,7 +237,7 @@ def collect_rays(
         A bundle for each primitive, the largest span of ranges (m), and an upper bound of the noise (m).
     """
     centres = np.array([(primitive.x, primitive.y) for primitive in primitives]).reshape(-1, 2)
-    radii = np.array([primitive.bounding_radius + reach for primitive in primitives])
+    radii = np.array([primitive.bounding_radius for primitive in primitives]) + reach
     first = np.array([ALWAYS if stamp is None else stamp for stamp in since or [None] * len(primitives)], np.int64)
     collector = RayCollector(centres, radii, options, first)
     for scan, pose in scans:

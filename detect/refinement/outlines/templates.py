@@ -18,7 +18,7 @@ import numpy as np
 from detect.refinement.likelihood.kernels import RayData
 from detect.refinement.likelihood.rays import RayBundle
 from detect.refinement.likelihood.sensor_model import BeamModel
-from detect.refinement.options import DEFAULTS, Descent, TemplateOptions
+from detect.refinement.options import DEFAULTS, Descent, EvidenceOptions, TemplateOptions
 from detect.refinement.outlines.kernels import outline_likelihood
 from detect.refinement.outlines.polygons import std_across
 from prim import linear_algebra
@@ -195,9 +195,10 @@ class Template:
         """Return the unit outline (V, 2) of some shares."""
         return self.outline(*shares.tolist())
 
-    def log_prior(self, max_extent: float) -> float:
-        """Return the log prior density (nats; rad, m, shares) without that of the position."""
-        return math.log(self.names / (2 * math.pi)) - (self.rigid - POSE) * math.log(max_extent)
+    def log_prior(self, q: FloatArray, prior: EvidenceOptions) -> float:
+        """Return the log prior density (nats; rad, m, shares) at parameters (K,) without that of the position."""
+        sizes = prior.log_size_density - np.log(q[POSE : self.rigid])
+        return math.log(self.names / (2 * math.pi)) + float(sizes.sum())
 
     def vertices(self, q: FloatArray) -> FloatArray:
         """Return the vertices (V, 2) in m of parameters (K,): x, y, theta, sizes (m), log odds of shares."""
@@ -324,18 +325,18 @@ class Cost:
     Attributes:
         data: The rays.
         scale: How many rays each stands for, over the dispersion.
-        max_extent: Upper bound (m) of sizes.
+        prior: The prior of sizes.
         options: Numeric parameters.
     """
 
     data: RayData
     scale: float
-    max_extent: float
+    prior: EvidenceOptions
     options: TemplateOptions
 
     @classmethod
     def of_rays(
-        cls, bundle: RayBundle, about: int, sensor: BeamModel, max_extent: float, options: TemplateOptions
+        cls, bundle: RayBundle, about: int, sensor: BeamModel, prior: EvidenceOptions, options: TemplateOptions
     ) -> Cost:
         """Make the cost of some of a bundle's rays.
 
@@ -343,7 +344,7 @@ class Cost:
             bundle: The rays.
             about: About how many are used.
             sensor: The sensor.
-            max_extent: Upper bound (m) of sizes.
+            prior: The prior of sizes.
             options: Numeric parameters.
 
         Returns:
@@ -351,7 +352,7 @@ class Cost:
         """
         stride = max(1, len(bundle) // about)
         data = sensor.data(bundle.select(slice(None, None, stride)))
-        return cls(data, stride / sensor.dispersion, max_extent, options)
+        return cls(data, stride / sensor.dispersion, prior, options)
 
     def of(self, vertices: FloatArray, blur: float) -> float:
         """Compute it for an outline.
@@ -401,7 +402,7 @@ class Cost:
         if logarithm is None:
             return -math.inf
         volume = 0.5 * (len(there.q) * math.log(2 * math.pi) - logarithm)
-        return -cost + volume + there.template.log_prior(self.max_extent) - math.log(len(TEMPLATES))
+        return -cost + volume + there.template.log_prior(there.q, self.prior) - math.log(len(TEMPLATES))
 
     def descend(self, template: Template, q: FloatArray, descent: Descent, least: float) -> Expansion:
         """Minimise it by Levenberg and Marquardt's method.
@@ -450,7 +451,7 @@ class Cost:
             (K,) those nearest to them that are allowed.
         """
         rigid, odds = template.rigid, self.options.max_log_odds
-        sizes = np.clip(q[POSE:rigid], self.options.min_size, self.max_extent)
+        sizes = np.clip(q[POSE:rigid], self.options.min_size, self.prior.bounds[1])
         return np.concatenate((q[:POSE], sizes, np.clip(q[rigid:], -odds, odds)))
 
 
@@ -459,7 +460,7 @@ def fit_templates(
     log_evidence: float,
     bundle: RayBundle,
     sensor: BeamModel,
-    max_extent: float = DEFAULTS.evidence.max_extent,
+    prior: EvidenceOptions = DEFAULTS.evidence,
     options: TemplateOptions = DEFAULTS.templates,
 ) -> list[TemplateFit]:
     """Fit templates to rays, as far as starts in the frames of the fitted kinds promise something.
@@ -469,14 +470,14 @@ def fit_templates(
         log_evidence: That of the likeliest kind (nats).
         bundle: The rays.
         sensor: The sensor.
-        max_extent: Upper bound (m) of sizes under the prior.
+        prior: The prior of sizes.
         options: Numeric parameters.
 
     Returns:
         One fit for each template that is not out of the question.
     """
     least = max(sensor.footprint, options.least_blur)
-    few, some, every = (Cost.of_rays(bundle, about, sensor, max_extent, options) for about in options.rays)
+    few, some, every = (Cost.of_rays(bundle, about, sensor, prior, options) for about in options.rays)
     outline = primitives[0].outline()
     first = _first_stage(primitives, outline, few, least)
     cost = every.of(outline, least)

@@ -177,7 +177,9 @@ class MapCells:
         outline, options = primitive.outline(OUTLINE_POINTS), self.options
         return any(wall.hides(outline, options.penetration, options.wall_depth) for wall in self.walls)
 
-    def without(self, primitives: Sequence[Primitive], margin: float) -> NDArray[np.bool_]:
+    def without(
+        self, primitives: Sequence[Primitive], margin: float, touching: float | None = None, blur: float | None = None
+    ) -> NDArray[np.bool_]:
         """Return the occupied cells (rows, cols) but for those of primitives.
 
         Noise blurs a primitive into cells around it: those that are connected with its own, and belong to nothing
@@ -186,26 +188,29 @@ class MapCells:
         Args:
             primitives: The primitives.
             margin: Cells this near (m) are a primitive's; of walls' cells, those that all but touch it.
+            touching: How near (m) these are; None: as in the options.
+            blur: How far (m) connected cells are a primitive's; None: as in the options.
 
         Returns:
             (rows, cols) bool.
         """
         occupied = self.occupied.copy()
-        touch = min(margin, self.options.touching)
+        touch = min(margin, self.options.touching if touching is None else touching)
+        blur = self.options.blur if blur is None else blur
         for primitive in primitives:
             rows, cols, points = _cells_around(self.frame, primitive, primitive.bounding_radius + margin)
-            near, touching = (is_within(primitive, points, reach) for reach in (margin, touch))
-            occupied[rows, cols] &= ~np.where(self.large[rows, cols], touching, near)
-            self._remove_connected(occupied, primitive, margin)
+            near, touches = (is_within(primitive, points, reach) for reach in (margin, touch))
+            occupied[rows, cols] &= ~np.where(self.large[rows, cols], touches, near)
+            self._remove_connected(occupied, primitive, margin, blur)
         return occupied
 
-    def _remove_connected(self, occupied: BoolGrid, primitive: Primitive, margin: float) -> None:
+    def _remove_connected(self, occupied: BoolGrid, primitive: Primitive, margin: float, blur: float) -> None:
         """Remove the cells from ``occupied`` that are connected with a primitive's, and no further than its blur."""
-        reach = primitive.bounding_radius + self.options.blur
+        reach = primitive.bounding_radius + blur
         rows, cols, points = _cells_around(self.frame, primitive, reach)
         labels, small = self.labels[rows, cols], ~self.large[rows, cols]
         own = np.unique(labels[is_within(primitive, points, margin) & small & (labels > 0)])
-        occupied[rows, cols] &= ~(np.isin(labels, own) & small & is_within(primitive, points, self.options.blur))
+        occupied[rows, cols] &= ~(np.isin(labels, own) & small & is_within(primitive, points, blur))
 
 
 def _cells_around(frame: GridFrame, primitive: Primitive, reach: float) -> tuple[slice, slice, FloatArray]:

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from detect.refinement.options import DEFAULTS, ProposalOptions
+from detect.refinement.surroundings.levels import MapLevels
 from detect.refinement.surroundings.map_cells import MapCells, is_within
 from mapping.morphology import dilate
 from prim import linear_algebra
@@ -20,23 +21,28 @@ from prim.arrays import FloatArray
 from prim.shapes import Kind, Primitive
 
 
-def propose(
-    cells: MapCells,
-    known: Sequence[Primitive],
-    max_proposals: int | None = None,
-    options: ProposalOptions = DEFAULTS.proposals,
-) -> list[Primitive]:
+def propose(levels: MapLevels, known: Sequence[Primitive], max_proposals: int | None = None) -> list[Primitive]:
     """Propose rectangles around the largest components that are in no known primitive.
 
     Args:
-        cells: The map.
+        levels: The map at several sizes of its cells; each component is proposed at the one that shows it.
         known: The primitives that are candidates already.
-        max_proposals: How many at most; None: ``options.max_proposals``.
-        options: Numeric parameters.
+        max_proposals: How many at each size at most; None: as in the options.
 
     Returns:
         Rectangles, those of most cells first.
     """
+    made: list[Primitive] = []
+    for level in levels:
+        proposed = _propose_at(level.cells, [*known, *made], max_proposals, level.options.proposals)
+        made += [around for around in proposed if levels.showing(around) is level]
+    return made
+
+
+def _propose_at(
+    cells: MapCells, known: Sequence[Primitive], max_proposals: int | None, options: ProposalOptions
+) -> list[Primitive]:
+    """Propose rectangles around the components of one map, those of most cells first."""
     made = []
     centroids = np.array([(primitive.x, primitive.y) for primitive in known]).reshape(-1, 2)
     reaches = np.array([primitive.bounding_radius + options.near for primitive in known])

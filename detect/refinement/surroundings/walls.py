@@ -57,6 +57,7 @@ def walls_behind(
     cells: MapCells,
     candidates: Sequence[Primitive],
     guesses: Sequence[Primitive],
+    beside: Sequence[Primitive] = (),
     options: WallOptions = DEFAULTS.walls,
     lines: LineOptions = DEFAULTS.lines,
 ) -> list[Wall]:
@@ -66,6 +67,7 @@ def walls_behind(
         cells: The map.
         candidates: The candidates as they are known now.
         guesses: What they were taken for first: a wall is seen from the side on which that stands.
+        beside: Further candidates, whose cells are no walls'.
         options: What a wall is.
         lines: How their lines are found.
 
@@ -75,7 +77,8 @@ def walls_behind(
     points, resolution = cells.wall_surface, cells.frame.resolution
     if not len(points):
         return []
-    centroids = np.array([(candidate.x, candidate.y) for candidate in candidates])
+    present = [*candidates, *beside]
+    centroids = np.array([(candidate.x, candidate.y) for candidate in present])
     made = []
     for candidate, guess in zip(candidates, guesses, strict=True):
         reach = candidate.bounding_radius + options.around
@@ -84,7 +87,7 @@ def walls_behind(
         if not is_within(candidate, close, options.near).any():
             continue
         for other in np.flatnonzero(_in_square(candidate, centroids, 2 * reach)).tolist():
-            near = near[~is_within(candidates[other], near, options.own)]
+            near = near[~is_within(present[other], near, options.own)]
         for rough in find_lines(near, resolution, 2 * options.min_length, 2, options.width, lines):
             inliers = near[distance_to_line(near, rough) < options.width * resolution]
             nx, ny, d = trimmed_line(inliers, resolution, lines)

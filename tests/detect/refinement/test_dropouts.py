@@ -33,7 +33,7 @@ def share_of(of: list[tuple[Scan, Pose2D]], guesses: tuple[Primitive, ...]) -> f
     bundles, _, _ = collect_rays(of, guesses, DEFAULTS.rays.reach)
     candidates = [Candidate(guess, bundle, cells) for guess, bundle in zip(guesses, bundles, strict=True)]
     with ThreadPoolExecutor(1) as pool:
-        find_backgrounds(pool, candidates, cells, DEFAULTS.map.cleared_first)
+        find_backgrounds(pool, candidates, is_first=True)
     return estimate_dropouts(candidates, 0.01)
 
 

@@ -33,6 +33,7 @@ from detect.refinement.refine import (
     rejection_reason,
 )
 from detect.refinement.surroundings.lines import find_lines
+from detect.refinement.surroundings.levels import MapLevels
 from detect.refinement.surroundings.map_cells import MapCells, OneSidedWall, is_within
 from detect.refinement.surroundings.proposals import propose
 from mapping.grid import GridFrame, OccupancyGrid
@@ -69,10 +70,10 @@ Scans = list[tuple[Scan, Pose2D]]
 
 
 def refine(
-    primitives: list[Primitive], taken: Scans, cells: MapCells, threads: int = 2, **given: object
+    primitives: list[Primitive], taken: Scans, levels: MapLevels, threads: int = 2, **given: object
 ) -> tuple[list[RefinedPrimitive | None], float | None]:
     """Refined primitives, and the noise (m)."""
-    refinement = Refinement(cells, threads=threads, **given)
+    refinement = Refinement(levels, threads=threads, **given)
     return refinement.run(primitives, taken), refinement.noise_std
 
 
@@ -93,7 +94,7 @@ def noisy() -> tuple[World, Scans, OccupancyGrid]:
 def test_exact_rays_give_the_exact_shapes(exact: tuple[World, Scans, OccupancyGrid]) -> None:
     world, taken, grid = exact
     rng = np.random.default_rng(3)
-    refined, _ = refine([disturbed(one, rng) for one in world.primitives], taken, MapCells.of(grid))
+    refined, _ = refine([disturbed(one, rng) for one in world.primitives], taken, MapLevels.of(grid))
     for made, true in zip(refined, world.primitives, strict=True):
         assert made is not None and made.primitive.kind is true.kind
         assert math.hypot(made.primitive.x - true.x, made.primitive.y - true.y) < 5e-4
@@ -107,7 +108,7 @@ def test_noisy_rays_give_kind_size_noise_and_standard_deviations(
 ) -> None:
     world, taken, grid = noisy
     rng = np.random.default_rng(4)
-    refined, noise = refine([disturbed(one, rng) for one in world.primitives], taken, MapCells.of(grid))
+    refined, noise = refine([disturbed(one, rng) for one in world.primitives], taken, MapLevels.of(grid))
     assert noise == pytest.approx(0.1, rel=0.05)
     normal = []
     for made, true in zip(refined, world.primitives, strict=True):
@@ -130,7 +131,7 @@ def test_the_kind_does_not_depend_on_the_guess(
     at = starts(true, guessed)[0]
     guess = primitive_of(guessed, np.array([true.x, true.y, 0.0, at[3], at[4]]))
     all_of_them = [guess if one is true else one for one in world.primitives]
-    refined, _ = refine(all_of_them, taken, MapCells.of(grid))
+    refined, _ = refine(all_of_them, taken, MapLevels.of(grid))
     made = refined[world.primitives.index(true)]
     assert made is not None and made.primitive.kind is true.kind
     assert polygon_iou(made.primitive, true) > 0.98
@@ -152,9 +153,9 @@ def beams_of(true: Primitive) -> tuple[RayBundle, BeamModel]:
     taken = scans(room(true), 0.01)
     (beams,), span, _ = collect_rays(taken, [true], 0.07)
     sensor = BeamModel.create(0.01, span)
-    candidate = Candidate(true, beams, MapCells.of(mapped(taken)))
+    candidate = Candidate(true, beams, MapLevels.of(mapped(taken)).levels[0].cells)
     with ThreadPoolExecutor(1) as pool:
-        find_backgrounds(pool, [candidate], candidate.cells, 0.03)
+        find_backgrounds(pool, [candidate], is_first=True)
     return candidate.rays_with_background([candidate], sensor), sensor
 
 
@@ -163,9 +164,9 @@ def test_rough_fits_are_repeated_with_all_rays() -> None:
     taken = scans(room(true), 0.05, rays=1500)
     (beams,), span, _ = collect_rays(taken, [true], 0.07)
     sensor = BeamModel.create(0.05, span)
-    candidate = Candidate(true, beams, MapCells.of(mapped(taken)))
+    candidate = Candidate(true, beams, MapLevels.of(mapped(taken)).levels[0].cells)
     with ThreadPoolExecutor(1) as pool:
-        find_backgrounds(pool, [candidate], candidate.cells, 0.03)
+        find_backgrounds(pool, [candidate], is_first=True)
         for anew in (True, False):
             fit_candidates(pool, [candidate], [anew], sensor)
             assert candidate.is_rough is anew
@@ -179,7 +180,7 @@ def test_results_do_not_depend_on_the_number_of_threads(
     world, taken, grid = noisy
     rng = np.random.default_rng(4)
     guesses = [disturbed(one, rng) for one in world.primitives]
-    one, four = (refine(guesses, taken, MapCells.of(grid), threads=threads)[0] for threads in (1, 4))
+    one, four = (refine(guesses, taken, MapLevels.of(grid), threads=threads)[0] for threads in (1, 4))
     assert [made and made.primitive for made in one] == [made and made.primitive for made in four]
     assert [made and dict(made.std) for made in one] == [made and dict(made.std) for made in four]
 
@@ -233,7 +234,7 @@ def test_close_to_a_wall(kind: Kind) -> None:
     world = room(at_wall)
     taken = scans(world, 0.2)
     guess = replace(at_wall, y=at_wall.y + 0.01)
-    refined, _ = refine([guess], taken, MapCells.of(mapped(taken)))
+    refined, _ = refine([guess], taken, MapLevels.of(mapped(taken)))
     assert refined[0] is not None and refined[0].primitive.kind is kind
     assert polygon_iou(refined[0].primitive, at_wall) > 0.9
 
@@ -245,7 +246,7 @@ def test_beside_a_wall_seen_from_both_sides(beyond: int) -> None:
     walls = (*room().walls, (-1.0, 0.0, 1.0, 0.0))
     taken = scans(World((2.0, 2.0), (one,), walls), 0.02)
     some = [entry for entry in taken if entry[1].y > 0] + beyond * [entry for entry in taken if entry[1].y < 0]
-    refined, _ = refine([one], some, MapCells.of(mapped(some)))
+    refined, _ = refine([one], some, MapLevels.of(mapped(some)))
     assert refined[0] is not None and polygon_iou(refined[0].primitive, one) > 0.97
 
 
@@ -264,7 +265,7 @@ def test_candidates_that_occlude_each_other(exact: tuple[World, Scans, Occupancy
     pair = [Primitive(Kind.CIRCLE, 0.0, 0.0, None, (0.1,)), Primitive(Kind.SQUARE, 0.24, 0.0, 0.0, (0.2,))]
     taken = scans(room(*pair), 0.02)
     rng = np.random.default_rng(1)
-    refined, _ = refine([disturbed(one, rng) for one in pair], taken, MapCells.of(mapped(taken)))
+    refined, _ = refine([disturbed(one, rng) for one in pair], taken, MapLevels.of(mapped(taken)))
     for made, true in zip(refined, pair, strict=True):
         assert made is not None and made.primitive.kind is true.kind and polygon_iou(made.primitive, true) > 0.97
 
@@ -274,7 +275,7 @@ def test_pose_errors_widen_standard_deviations() -> None:
     taken = scans(room(one), 0.01)
     rng = np.random.default_rng(2)
     off = [(scan, Pose2D(p.x + rng.normal(0, 0.02), p.y + rng.normal(0, 0.02), p.theta)) for scan, p in taken]
-    sure, unsure = (refine([one], some, MapCells.of(mapped(some)))[0][0] for some in (taken, off))
+    sure, unsure = (refine([one], some, MapLevels.of(mapped(some)))[0][0] for some in (taken, off))
     assert sure is not None and unsure is not None
     assert unsure.std["x"] > 3 * sure.std["x"]
     assert abs(unsure.primitive.x - one.x) < 5 * unsure.std["x"]
@@ -297,7 +298,7 @@ def test_scans_without_information(ranges: np.ndarray) -> None:
 def test_a_sensor_with_infinite_range(exact: tuple[World, Scans, OccupancyGrid]) -> None:
     world, taken, grid = exact
     endless = [(replace(scan, range_max=math.inf), pose) for scan, pose in taken]
-    refined, noise = refine([world.primitives[0]], endless, MapCells.of(grid))
+    refined, noise = refine([world.primitives[0]], endless, MapLevels.of(grid))
     assert refined[0] is not None and refined[0].primitive.kind is Kind.SQUARE and noise is not None
     assert all(math.isfinite(value) and value > 0 for value in refined[0].std.values())
 
@@ -314,8 +315,8 @@ def test_objects_larger_than_any_primitive_are_rejected(
 
 def test_nothing_to_refine(exact: tuple[World, Scans, OccupancyGrid]) -> None:
     _, _, grid = exact
-    assert refine([], [], MapCells.of(grid)) == ([], None)
-    assert refine(FIVE, [], MapCells.of(grid)) == ([None] * 5, None)
+    assert refine([], [], MapLevels.of(grid)) == ([], None)
+    assert refine(FIVE, [], MapLevels.of(grid)) == ([None] * 5, None)
     frame = GridFrame.covering((-1, -1, 1, 1), 0.01)
     empty = OccupancyGrid(frame, np.full(frame.shape, 0.5, np.float32))
     assert refine_detections(Detections((), ()), [], empty)[0] == Detections((), ())
@@ -390,14 +391,15 @@ def test_walls_are_large_and_primitives_are_not(
     exact: tuple[World, Scans, OccupancyGrid],
 ) -> None:
     world, _, grid = exact
-    cells = MapCells.of(grid)
+    levels = MapLevels.of(grid)
+    cells = levels.levels[0].cells
     rows, cols = np.nonzero(cells.occupied)
     points = (np.column_stack((cols + grid.frame.col, rows + grid.frame.row)) + 0.5) * grid.frame.resolution
     near = np.any([is_within(one, points, 0.02) for one in world.primitives], axis=0)
     assert near.any() and not cells.large[rows[near], cols[near]].any()
     assert cells.large[rows[~near], cols[~near]].all()
     assert len(cells.walls) == 4 and not any(cells.is_behind_wall(one) for one in world.primitives)
-    assert len(propose(cells, [])) == 5 and propose(cells, world.primitives) == []
+    assert len(propose(levels, [])) == 5 and propose(levels, world.primitives) == []
 
 
 def test_reasons_name_the_limit() -> None:
@@ -428,10 +430,10 @@ def test_drifting_poses_widen_standard_deviations() -> None:
     moved = [
         (scan, replace(pose, x=pose.x + off, y=pose.y - off)) for (scan, pose), off in zip(taken, drift, strict=True)
     ]
-    cells = MapCells.of(mapped(moved))
-    (by_stretches,), _ = refine([true], moved, cells)
+    grid = mapped(moved)
+    (by_stretches,), _ = refine([true], moved, MapLevels.of(grid))
     without_stretches = replace(DEFAULTS, sensor=replace(DEFAULTS.sensor, stretches=()))
-    (by_scans_alone,), _ = refine([true], moved, cells, options=without_stretches)
+    (by_scans_alone,), _ = refine([true], moved, MapLevels.of(grid, without_stretches))
     assert by_stretches is not None and by_scans_alone is not None
     assert all(by_stretches.std[name] > 1.2 * by_scans_alone.std[name] for name in ("x", "y"))
 
@@ -455,7 +457,7 @@ def test_a_side_that_nobody_saw_is_not_known(depth: float) -> None:
     box = Primitive(Kind.RECTANGLE, 0.0, depth / 2, 0.0, (0.3, depth)).canonical()
     taken = scans_of_a_front(box)
     guess = Primitive(Kind.RECTANGLE, 0.01, 0.1, 0.05, (0.29, 0.2))
-    (made,), _ = refine([guess], taken, MapCells.of(mapped(taken)))
+    (made,), _ = refine([guess], taken, MapLevels.of(mapped(taken)))
     assert made is not None and made.primitive.kind is Kind.RECTANGLE
     along = made.primitive.theta or 0.0
     names = Kind.RECTANGLE.sizes if abs(math.sin(along)) < 0.7 else Kind.RECTANGLE.sizes[::-1]
@@ -471,9 +473,9 @@ def test_a_triangle_with_few_rays_may_have_another_apex() -> None:
     taken = scans(room(true), 0.3, rays=120, stops=5)
     (beams,), span, _ = collect_rays(taken, [true], 0.07)
     sensor = BeamModel.create(0.3, span)
-    candidate = Candidate(true, beams, MapCells.of(mapped(scans(room(true), 0.01))))
+    candidate = Candidate(true, beams, MapLevels.of(mapped(scans(room(true), 0.01))).levels[0].cells)
     with ThreadPoolExecutor(1) as pool:
-        find_backgrounds(pool, [candidate], candidate.cells, 0.03)
+        find_backgrounds(pool, [candidate], is_first=True)
     beams = candidate.rays_with_background([candidate], sensor)
     guess = KindFit(Kind.TRIANGLE, parameters_of(true), 0.0, np.eye(5))
     modes = [fit for fit in refit([guess], beams, sensor) if fit.kind is Kind.TRIANGLE]

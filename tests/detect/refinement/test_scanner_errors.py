@@ -19,7 +19,7 @@ from detect.refinement.likelihood.scanner_errors import ScannerErrors, Surroundi
 from detect.refinement.likelihood.sensor_model import Background, BeamModel
 from detect.refinement.refine import Refinement
 from detect.refinement.scanner_errors import BiasExpansion, Profile, common_step, errors_of, with_shared_errors
-from detect.refinement.surroundings.map_cells import MapCells
+from detect.refinement.surroundings.levels import MapLevels
 from prim.se2 import rotate
 from prim.shapes import Kind, Primitive
 from replay.notes import sensor_notes
@@ -44,7 +44,7 @@ def measured(bias: float = 0.0, width: float = 0.0, reading: str = "nearest", pa
 
 def refined(taken) -> tuple[list[float], SensorErrors | None, list[float]]:
     """Errors (m) of the sizes, what was found of the scanner, and the errors in standard deviations."""
-    refinement = Refinement(MapCells.of(mapped(taken)), threads=1)
+    refinement = Refinement(MapLevels.of(mapped(taken)), threads=1)
     starts = [replace(true, x=true.x + 0.004, y=true.y - 0.003) for true in WORLD.primitives]
     errors, normal = [], []
     for result, true in zip(refinement.run(starts, taken), WORLD.primitives, strict=True):

@@ -18,7 +18,7 @@ from detect.refinement.likelihood.rays import collect_rays
 from detect.refinement.options import RefinementOptions
 from detect.refinement.refine import Effort, refine_detections
 from detect.refinement.standing import Verdict, judge_places
-from detect.refinement.surroundings.map_cells import MapCells
+from detect.refinement.surroundings.levels import MapLevels
 from mapping.grid import OccupancyGrid
 from mapping.mapper import make_mapper
 from prim.scan import Scan
@@ -58,7 +58,7 @@ def verdicts(found: list[Primitive], scans: list[tuple[Scan, Pose2D]], slack: fl
     detections = [Detection(primitive, 1.0, box, crop) for primitive in found]
     return [
         judgement.verdict
-        for judgement in judge_places(detections, scans, MapCells.of(mapper.grid()), NOISE, 2, slack)
+        for judgement in judge_places(detections, scans, MapLevels.of(mapper.grid()), NOISE, 2, slack)
     ]
 
 
@@ -116,11 +116,11 @@ def test_later_scans_that_disagree_with_a_fit_widen_its_error_bars() -> None:
     mixed = [*scans_of(SQUARE)[:8], *later(scans_of(pushed), 8)]
     fit = fit_to(mixed, pushed)
     assert deviations(fit, pushed) > 3
-    assert deviations(add_disagreement(fit, mixed, MapCells.of(map_of(mixed)), NOISE), pushed) < 3
+    assert deviations(add_disagreement(fit, mixed, MapLevels.of(map_of(mixed)), NOISE), pushed) < 3
     alike = [*scans_of(SQUARE), *later(scans_of(SQUARE, seed=1), 12)]
     fit = fit_to(alike, SQUARE)
     assert deviations(fit, SQUARE) < 3
-    assert add_disagreement(fit, alike, MapCells.of(map_of(alike)), NOISE) is fit
+    assert add_disagreement(fit, alike, MapLevels.of(map_of(alike)), NOISE) is fit
 
 
 def test_what_was_pushed_within_the_recent_scans_has_error_bars_that_cover_it() -> None:
@@ -128,7 +128,7 @@ def test_what_was_pushed_within_the_recent_scans_has_error_bars_that_cover_it() 
     recent = [*later(scans_of(between)[:8], 12), *later(scans_of(end), 20)]
     scans = [*scans_of(SQUARE), *recent]
     grid, before = map_of(scans), fit_to(scans[:12], SQUARE)
-    look = Look(Detections((before,), ()), grid, MapCells.of(grid), NOISE, recent, scans)
+    look = Look(Detections((before,), ()), grid, MapLevels.of(grid), NOISE, recent, scans)
     moved = MovedPrimitives(map_of, lambda _: Detections((), ()), (0.0, 0.0))
     (found,) = moved.correct(look, lambda: scans, Effort(max_proposals=0)).found
     assert found.since == 12 and deviations(found, end) < 3
@@ -146,7 +146,7 @@ def test_objects_of_no_kind_stay_but_where_something_has_moved_to() -> None:
     standing, pushed = scans[:12], scans[12:]
     for recent, objects in ((standing, (far, near)), (pushed, (far,))):
         detections = Detections((before,), (), objects=(far, near))
-        look = Look(detections, grid, MapCells.of(grid), NOISE, recent, scans)
+        look = Look(detections, grid, MapLevels.of(grid), NOISE, recent, scans)
         moved = MovedPrimitives(map_of, lambda _: Detections((), ()), (0.0, 0.0))
         assert moved.correct(look, lambda: scans, Effort(max_proposals=0)).objects == objects
 
@@ -157,9 +157,9 @@ def test_what_was_found_and_is_an_object_to_all_scans_is_sought_by_the_recent_on
     scans = [*scans_of(SQUARE), *later(scans_of(end), 12)]
     grid, before = map_of(scans), fit_to(scans[:12], SQUARE)
     smeared = UnknownObject(np.vstack([SQUARE.outline()[:2], end.outline()[2:]]), 0.004, 0.9, "none", {})
-    cells, detected = MapCells.of(grid), Detections((replace(before, primitive=end),), ())
-    first = Look(Detections((before,), ()), grid, cells, NOISE, scans[:12], scans[:12])
-    second = Look(Detections((), (), objects=(smeared,)), grid, cells, NOISE, scans[12:], scans)
+    levels, detected = MapLevels.of(grid), Detections((replace(before, primitive=end),), ())
+    first = Look(Detections((before,), ()), grid, levels, NOISE, scans[:12], scans[:12])
+    second = Look(Detections((), (), objects=(smeared,)), grid, levels, NOISE, scans[12:], scans)
     for looks, counts in (([first, second], (1, 0)), ([second], (0, 1)), ([first, *[second] * 5], (1, 0))):
         moved = MovedPrimitives(map_of, lambda _: detected, (0.0, 0.0))
         for look in looks:
@@ -170,7 +170,7 @@ def test_what_was_found_and_is_an_object_to_all_scans_is_sought_by_the_recent_on
 
 def test_what_was_lost_is_sought_at_some_looks_alone() -> None:
     grid, before = map_of(scans_of(SQUARE)), fit_to(scans_of(SQUARE), SQUARE)
-    cells, recent = MapCells.of(grid), scans_of()
+    levels, recent = MapLevels.of(grid), scans_of()
     maps: list[int] = []
 
     def watched(scans: Sequence[tuple[Scan, Pose2D]]) -> OccupancyGrid:
@@ -179,7 +179,7 @@ def test_what_was_lost_is_sought_at_some_looks_alone() -> None:
 
     moved = MovedPrimitives(watched, lambda _: Detections((), ()), (0.0, 0.0), options=MovedOptions(looks=2))
     for found in ((before,), (), (), (), (before,), (before,)):
-        look = Look(Detections(found, ()), grid, cells, NOISE, scans_of(SQUARE), [])
+        look = Look(Detections(found, ()), grid, levels, NOISE, scans_of(SQUARE), [])
         moved.correct(look, lambda: recent, Effort(max_proposals=0))
     assert len(maps) == 2
 
@@ -201,7 +201,7 @@ def test_what_moves_is_refined_and_judged_with_the_options_of_the_replay(monkeyp
     watched(mixed_places, "judge_places")
     scans = [*scans_of(SQUARE), *later(scans_of(replace(SQUARE, x=SQUARE.x - 0.14)), 12)]
     grid, before = map_of(scans), fit_to(scans[:12], SQUARE)
-    look = Look(Detections((before,), ()), grid, MapCells.of(grid), NOISE, scans[12:], scans)
+    look = Look(Detections((before,), ()), grid, MapLevels.of(grid), NOISE, scans[12:], scans)
     options = RefinementOptions(closed_world=True)
     moved = MovedPrimitives(map_of, lambda _: Detections((), ()), (0.0, 0.0), options)
     assert moved.correct(look, lambda: scans, Effort(max_proposals=0)).found

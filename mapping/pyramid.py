@@ -1,0 +1,104 @@
+"""A map at several sizes of its cells, so that things of any size are seen in about as many cells.
+
+What learnt to see shapes, or was set, in cells of one size serves all: networks see shapes in cells.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mapping.grid import UNKNOWN, GridFrame, OccupancyGrid
+
+DEFAULT_SIZES = (0.05, 2.0)
+"""The smallest and the largest object that is looked for (m), by its longest side or its diameter."""
+
+SEEN_CELLS = 48.0
+"""Things of up to so many cells across are looked for at a level; those that are larger at the next, in cells of twice
+the size. The paper's largest square, 0.32 m in cells of 1 cm, is 45 across."""
+
+FEWEST_CELLS = 5.0
+"""Things that are seen in fewer cells have no shape."""
+
+ROUNDING = 1e-6
+"""Relative rounding errors of resolutions."""
+
+
+@dataclass(frozen=True)
+class Level:
+    """One size of a map's cells.
+
+    Attributes:
+        factor: How many of the map's cells make one of its own, along each axis.
+        resolution: The side of its cells (m).
+        extents: From which to which extent (m), from corner to corner, things are looked for in it.
+    """
+
+    factor: int
+    resolution: float
+    extents: tuple[float, float]
+
+
+def levels_for(resolution: float, sizes: tuple[float, float]) -> tuple[Level, ...]:
+    """Choose the levels at which a map shows things of all sizes that are wanted.
+
+    Args:
+        resolution: The side of the map's cells (m).
+        sizes: The smallest and the largest size (m): the longest side, or the diameter.
+
+    Returns:
+        The levels, the finest first, each with cells of twice the size of the one before.
+    """
+    smallest, largest = sizes
+    factor = 1
+    while 2 * factor * resolution * FEWEST_CELLS <= smallest * (1 + ROUNDING):
+        factor *= 2
+    widest, lower = largest * np.sqrt(2), 0.0
+    levels: list[Level] = []
+    while not levels or lower < widest * (1 - ROUNDING):
+        upper = SEEN_CELLS * factor * resolution
+        levels.append(Level(factor, factor * resolution, (lower, upper)))
+        factor, lower = 2 * factor, upper
+    return tuple(levels)
+
+
+def coarser(grid: OccupancyGrid, factor: int) -> OccupancyGrid:
+    """Return a map with larger cells.
+
+    A cell is as likely occupied as the likeliest of those in it where one is occupied, else as likely as those that
+    are known are on average. It was visited by as many rays as cross as many of these in a row.
+
+    Args:
+        grid: The map.
+        factor: How many of its cells make one, along each axis.
+
+    Returns:
+        The map, on whole multiples of its resolution; ``grid`` itself where the factor is 1.
+    """
+    if factor == 1:
+        return grid
+    fine = grid.frame
+    row, col = fine.row // factor, fine.col // factor
+    rows = -(-(fine.row + fine.rows) // factor) - row
+    cols = -(-(fine.col + fine.cols) // factor) - col
+    frame = GridFrame(fine.resolution * factor, row, col, rows, cols)
+    covered = GridFrame(fine.resolution, row * factor, col * factor, rows * factor, cols * factor)
+
+    def blocks(values: NDArray[np.float32], fill: float) -> NDArray[np.float32]:
+        """Return the values (rows, factor, cols, factor) of the cells in each larger one."""
+        padded = np.full(covered.shape, fill, np.float32)
+        padded[covered.window(fine)] = values
+        return padded.reshape(rows, factor, cols, factor)
+
+    parts = blocks(grid.probability, float(UNKNOWN))
+    likeliest, known = parts.max(axis=(1, 3)), parts != UNKNOWN
+    count = known.sum(axis=(1, 3))
+    total = np.where(known, parts, np.float32(0)).sum(axis=(1, 3))
+    mean = np.where(count > 0, total / np.maximum(count, 1), UNKNOWN)
+    probability = np.where(likeliest > UNKNOWN, likeliest, mean).astype(np.float32)
+    visits = None
+    if grid.visits is not None:
+        visits = (blocks(grid.visits, 0.0).sum(axis=(1, 3)) / np.float32(factor)).astype(np.float32)
+    return OccupancyGrid(frame, probability, visits)
