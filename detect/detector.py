@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import itertools
 import math
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import islice
 from pathlib import Path
@@ -19,7 +20,7 @@ from detect.networks.weights import BATCHES, Weights, load_weight_set
 from detect.networks.yolo import KINDS, Boxes, Yolo, box_iou, non_maximum_suppression
 from mapping.grid import GridFrame, OccupancyGrid
 from mapping.morphology import isolated_boxes
-from mapping.pyramid import DEFAULT_SIZES, SEEN_CELLS, Level, coarser, levels_for
+from mapping.pyramid import DEFAULT_SIZES, ROUNDING, SEEN_CELLS, coarser, levels_for
 from prim.metrics import overlap_coefficient, polygon_iou
 from prim.world import Bounds
 
@@ -62,8 +63,8 @@ class DetectorOptions:
     is larger; set by hand."""
 
     slack: float = 0.8
-    """What is by this factor smaller, or as much larger, than what is looked for in cells of one size counts, too: the
-    networks' sizes are not exact. Set by hand."""
+    """What is by this factor smaller, or as much larger, than what is looked for in cells of one size counts, too:
+    the networks' sizes are not exact. Set by hand."""
 
     border: int = 2
     """Boxes this near (cells) to a tile's border, where the map goes on, are left to the next tile; set by hand."""
@@ -88,6 +89,33 @@ class _TileCandidates:
     tile: GridFrame
     grey: NDArray[np.uint8]
     boxes: Boxes
+
+
+@dataclass(frozen=True)
+class _SeenMap:
+    """A map as the networks see it.
+
+    Attributes:
+        grid: The map, with cells as they know them.
+        tiles: The tiles that are looked at.
+        extents: From which to which extent (cells), from corner to corner, primitives are looked for.
+        scale: How many times as large its cells really are.
+    """
+
+    grid: OccupancyGrid
+    tiles: tuple[GridFrame, ...]
+    extents: tuple[float, float]
+    scale: float
+
+
+NOTHING = Detections((), ())
+
+Progress = Callable[[int, int], None]
+"""Called with what is done and what there is in all."""
+
+
+def no_progress(done: int, total: int) -> None:
+    """Report nothing."""
 
 
 Item = TypeVar("Item")
@@ -140,12 +168,15 @@ class Detector:
         """
         return cls(*load_weight_set(path, mapper, threads))
 
-    def detect(self, grid: OccupancyGrid, sizes: tuple[float, float] = DEFAULT_SIZES) -> Detections:
+    def detect(
+        self, grid: OccupancyGrid, sizes: tuple[float, float] = DEFAULT_SIZES, progress: Progress = no_progress
+    ) -> Detections:
         """Detect the primitives in a map, each in cells of a size that shows it well.
 
         Args:
             grid: The map, with cells of any size.
             sizes: The smallest and the largest size that is looked for (m): the longest side, or the diameter.
+            progress: Called after each tile with their number so far and in all.
 
         Returns:
             Detections, rejected and doubtful candidates.
@@ -153,21 +184,31 @@ class Detector:
         Raises:
             WeightsError: A network does not take its images, or gives outputs that are not finite.
         """
-        parts, factor = [], 1
-        for level in levels_for(grid.frame.resolution, sizes):
-            grid, factor = coarser(grid, level.factor // factor), level.factor
-            parts.append(self._detect_at(grid, level))
+        seen = list(self._seen_at_levels(grid, sizes))
+        total = sum(len(one.tiles) for one in seen)
+        done = itertools.count(1)
+
+        def images(one: _SeenMap) -> Iterator[tuple[GridFrame, NDArray[np.uint8]]]:
+            """Yield the tiles' images."""
+            for tile in one.tiles:
+                yield tile, tile_image(one.grid, tile, self.card.style)
+                progress(next(done), total)
+
+        parts = [
+            _scaled(self.detect_tiles(images(one), one.grid.frame, one.extents), one.scale) if one.tiles else NOTHING
+            for one in seen
+        ]
         return parts[0] if len(parts) == 1 else self._merged(parts)
 
-    def _detect_at(self, grid: OccupancyGrid, level: Level) -> Detections:
-        """Detect what is looked for at one size of a map's cells, which the networks take for those they know."""
-        scale = level.resolution / self.card.resolution
-        known = replace(grid, frame=replace(grid.frame, resolution=self.card.resolution))
-        tiles = _tiles_of_things(known)
-        images = ((tile, tile_image(known, tile, self.card.style)) for tile in tiles)
-        lower, upper = (extent / level.resolution for extent in level.extents)
-        found = self.detect_tiles(images, known.frame, (self.options.slack * lower, upper / self.options.slack))
-        return found if math.isclose(scale, 1, rel_tol=1e-6) else _scaled(found, scale)
+    def _seen_at_levels(self, grid: OccupancyGrid, sizes: tuple[float, float]) -> Iterator[_SeenMap]:
+        """Yield a map at each size of its cells that the wanted things need, taken for the one the networks know."""
+        factor, slack = 1, self.options.slack
+        for level in levels_for(grid.frame.resolution, sizes):
+            grid, factor = coarser(grid, level.factor // factor), level.factor
+            known = replace(grid, frame=replace(grid.frame, resolution=self.card.resolution))
+            lower, upper = (extent / level.resolution for extent in level.extents)
+            scale = level.resolution / self.card.resolution
+            yield _SeenMap(known, tuple(_tiles_of_things(known)), (slack * lower, upper / slack), scale)
 
     def _merged(self, parts: Sequence[Detections]) -> Detections:
         """Put together what was detected in cells of several sizes."""
@@ -219,7 +260,7 @@ class Detector:
             if better != i
         }
         reasons |= dict.fromkeys(excess.tolist(), f"its tile has {self.options.max_per_tile} better ones")
-        nowhere = "it is no primitive of a size that is looked for in such cells"
+        nowhere = "its tile holds no such primitive, or its size is looked for in other cells"
         reasons |= {i: nowhere for i in kept.tolist() if i not in estimated}
         rejections = {i: _rejection(boxes, i, frame, reason) for i, reason in reasons.items()}
         chosen = self._doubtful(boxes, whole & (suppressor < 0), kept)
@@ -388,6 +429,8 @@ def _is_inside(boxes: NDArray[np.intp], tile: GridFrame, frame: GridFrame) -> ND
 
 def _scaled(found: Detections, scale: float) -> Detections:
     """Return detections in a map whose cells are so many times as large."""
+    if math.isclose(scale, 1, rel_tol=ROUNDING):
+        return found
 
     def larger(detection: Detection) -> Detection:
         primitive = detection.primitive

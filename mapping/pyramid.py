@@ -5,10 +5,10 @@ What learnt to see shapes, or was set, in cells of one size serves all: networks
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mapping.grid import UNKNOWN, GridFrame, OccupancyGrid
 
@@ -16,11 +16,13 @@ DEFAULT_SIZES = (0.05, 2.0)
 """The smallest and the largest object that is looked for (m), by its longest side or its diameter."""
 
 SEEN_CELLS = 48.0
-"""Things of up to so many cells across are looked for at a level; those that are larger at the next, in cells of twice
-the size. The paper's largest square, 0.32 m in cells of 1 cm, is 45 across."""
+"""Things of up to so many cells across are looked for at a level; those that are larger at the next, in cells twice
+as large. The paper's largest square, 0.32 m in cells of 1 cm, is 45 across."""
 
 FEWEST_CELLS = 5.0
 """Things that are seen in fewer cells have no shape."""
+
+Slices = tuple[slice, slice]
 
 ROUNDING = 1e-6
 """Relative rounding errors of resolutions."""
@@ -84,21 +86,28 @@ def coarser(grid: OccupancyGrid, factor: int) -> OccupancyGrid:
     rows = -(-(fine.row + fine.rows) // factor) - row
     cols = -(-(fine.col + fine.cols) // factor) - col
     frame = GridFrame(fine.resolution * factor, row, col, rows, cols)
-    covered = GridFrame(fine.resolution, row * factor, col * factor, rows * factor, cols * factor)
+    likeliest, total = np.full(frame.shape, UNKNOWN), np.zeros(frame.shape, np.float32)
+    known = np.zeros(frame.shape, np.float32)
+    visits = None if grid.visits is None else np.zeros(frame.shape, np.float32)
+    for inner, larger in _parts(fine, frame, factor):
+        part = grid.probability[inner]
+        is_known = part != UNKNOWN
+        likeliest[larger] = np.maximum(likeliest[larger], part)
+        total[larger] += np.where(is_known, part, np.float32(0))
+        known[larger] += is_known
+        if visits is not None and grid.visits is not None:
+            visits[larger] += grid.visits[inner] / np.float32(factor)
+    mean = np.where(known > 0, total / np.maximum(known, 1), UNKNOWN)
+    return OccupancyGrid(frame, np.where(likeliest > UNKNOWN, likeliest, mean).astype(np.float32), visits)
 
-    def blocks(values: NDArray[np.float32], fill: float) -> NDArray[np.float32]:
-        """Return the values (rows, factor, cols, factor) of the cells in each larger one."""
-        padded = np.full(covered.shape, fill, np.float32)
-        padded[covered.window(fine)] = values
-        return padded.reshape(rows, factor, cols, factor)
 
-    parts = blocks(grid.probability, float(UNKNOWN))
-    likeliest, known = parts.max(axis=(1, 3)), parts != UNKNOWN
-    count = known.sum(axis=(1, 3))
-    total = np.where(known, parts, np.float32(0)).sum(axis=(1, 3))
-    mean = np.where(count > 0, total / np.maximum(count, 1), UNKNOWN)
-    probability = np.where(likeliest > UNKNOWN, likeliest, mean).astype(np.float32)
-    visits = None
-    if grid.visits is not None:
-        visits = (blocks(grid.visits, 0.0).sum(axis=(1, 3)) / np.float32(factor)).astype(np.float32)
-    return OccupancyGrid(frame, probability, visits)
+def _parts(fine: GridFrame, frame: GridFrame, factor: int) -> Iterator[tuple[Slices, Slices]]:
+    """Yield the cells of a map that lie at one place in their larger cell, and these cells: views, no copies."""
+    for i in range(factor):
+        for j in range(factor):
+            first_row, first_col = (i - fine.row) % factor, (j - fine.col) % factor
+            row, col = (fine.row + first_row) // factor - frame.row, (fine.col + first_col) // factor - frame.col
+            rows = len(range(first_row, fine.rows, factor))
+            cols = len(range(first_col, fine.cols, factor))
+            inner = slice(first_row, None, factor), slice(first_col, None, factor)
+            yield inner, (slice(row, row + rows), slice(col, col + cols))

@@ -197,8 +197,8 @@ class ReplayOptions:
         smallest, largest = self.sizes
         if not MIN_SIZE <= smallest <= largest / 2 or not largest <= MAX_SIZE:
             raise UsageError(
-                f"--sizes is {smallest:g} {largest:g}: give the smallest and the largest size, at least twice as large, "
-                f"from {MIN_SIZE:g} to {MAX_SIZE:g} m, such as --sizes 0.05 2"
+                f"--sizes is {smallest:g} {largest:g}: give the smallest size and the largest, at least twice as "
+                f"large, from {MIN_SIZE:g} to {MAX_SIZE:g} m, such as --sizes 0.05 2"
             )
         if self.sizes != DEFAULT_SIZES and not self.detect:
             raise UsageError("--sizes is for detection: it excludes --no-detect")

@@ -23,7 +23,7 @@ TILE_OVERLAP = 80
 primitive lies whole in some tile."""
 
 TILE_MARGIN = 24
-"""Cells around what a tile is made for, where the map goes on: what is beside it tells it from a part; set by hand."""
+"""Cells around what a tile is made for, where the map goes on: they tell a thing from a part; set by hand."""
 
 STYLES = ("grey", "rounded")
 """How cells are rendered in three channels; model cards hold the names.

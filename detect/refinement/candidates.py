@@ -283,7 +283,7 @@ def without_candidates(cells: MapCells, candidates: Sequence[Candidate], is_firs
 def _find_backgrounds_at(
     pool: Executor, candidates: Sequence[Candidate], present: Sequence[Candidate], is_first: bool
 ) -> list[bool]:
-    """Read from one map what stands behind the candidates that are seen in it, all others that are present left out."""
+    """Read from one map what stands behind the candidates that are seen in it; all that are present are left out."""
     cells, options = candidates[0].cells, candidates[0].options
     shapes, guesses = [one.current for one in candidates], [one.start for one in candidates]
     own = {id(candidate) for candidate in candidates}

@@ -31,6 +31,10 @@ class RayOptions:
 
     max_rays: int = 8000
     """Rays of one candidate; of more than twice as many every other scan is left out. Bounds the time."""
+    max_total: int = 200_000
+    """Rays of all candidates together, about, as long as each has …"""
+    min_rays: int = 2000
+    """… so many."""
     max_range: float = 1000.0
     """m; a sensor whose range_max is larger, or infinite, is taken to reach so far."""
     reach: float = scaled(0.07)
@@ -150,6 +154,8 @@ class ScannerOptions:
     """Halvings of the interval around the best."""
     turns: int = 3
     """Fits in a row, each with rays turned to the nearest surface of the fit before."""
+    asked: int = 12
+    """The most candidates that are asked, those that most rays meet: it bounds the time."""
     first_footprint: float = 0.001
     """m; the footprint is no larger where a width is searched. Where one is known it is 0: jumps show it best."""
     reach_std: float = 0.0003
@@ -442,6 +448,10 @@ class AcceptanceOptions:
 
     min_log_ratio: float = 25.0
     """nats; log-likelihood ratio of the rays against nothing in its place."""
+    hopeless: float = 0.0
+    """nats; after the first fits, to some of the rays, candidates with less are given up."""
+    hopeless_misfit: float = 1.0
+    """nats a ray; so are those whose rays the map alone explains better by more."""
     max_misfit: float = 0.25
     """nats a ray; by which the map alone explains the rays that meet it better."""
     max_relative_std: float = 0.25
@@ -747,6 +757,12 @@ class RefinementOptions:
     """Joint fits of all candidates once duplicates are gone."""
     converged: float = 0.002
     """m, rad; rounds end where no parameter moves by more."""
+
+    def with_rays_for(self, candidates: int) -> RefinementOptions:
+        """Return the numbers with no more rays for each of so many candidates than all of them may have together."""
+        rays = self.rays
+        most = min(rays.max_rays, max(rays.max_total // max(candidates, 1), rays.min_rays))
+        return replace(self, rays=replace(rays, max_rays=most))
 
     def at_scale(self, factor: float) -> RefinementOptions:
         """Return the numbers for things that are so many times as large, in cells that are.

@@ -261,7 +261,7 @@ def rejection_reason(result: RefinedPrimitive | None, limits: AcceptanceOptions 
         The reason; empty where they do not.
     """
     if result is None:
-        return "no ray passes it, a likelier one stands in its place, or it is too large or reaches into a wall"
+        return "the rays speak against it, a likelier one stands in its place, or it is too large or reaches into a wall"
     if result.log_ratio < limits.min_log_ratio:
         return (
             f"the rays are likelier with it by {result.log_ratio:.0f} nats only, less than {limits.min_log_ratio:g}"
@@ -413,6 +413,7 @@ class Refinement:
         if not primitives:
             return []
         shown = [self.levels.showing(primitive) for primitive in primitives]
+        bounded = self.options.with_rays_for(len(primitives))
         sites = [] if self.options.closed_world else self._find_sites(primitives, shown)
         alone = [site for site in sites if site.covered_by is None]
         circles = [site.circle for site in alone]
@@ -420,7 +421,7 @@ class Refinement:
         stamps += [stamps[site.members[0]] for site in alone]
         reaches = [level.options.rays.reach for level in shown]
         reaches += [reaches[site.members[0]] for site in alone]
-        bundles, span, max_noise = collect_rays(scans, [*primitives, *circles], reaches, self.options, stamps)
+        bundles, span, max_noise = collect_rays(scans, [*primitives, *circles], reaches, bounded, stamps)
         for site, bundle in zip(alone, bundles[len(primitives) :], strict=True):
             site.bundle = bundle
         detections = known or {}
@@ -478,8 +479,13 @@ class Refinement:
         find_backgrounds(pool, seen, is_first=True)
         dropouts = estimate_dropouts(seen, noise, options.sensor)
         sensor = BeamModel.create(noise, span, max_std=max_noise, options=options.sensor, dropout_share=dropouts)
-        fit_candidates(pool, seen, [True] * len(seen), sensor)
-        single = self._near_rays(without_duplicates(seen, preferred, sensor))
+        likely = [candidate for candidate in seen if any(candidate is one for one in preferred)]
+        others = [candidate for candidate in seen if not any(candidate is one for one in likely)]
+        fit_candidates(pool, likely, [True] * len(likely), sensor)
+        fit_candidates(pool, others, [True] * len(others), sensor, likely)
+        maps = {id(part[0].cells): _whole_map(part[0].cells) for part in by_level(seen)}
+        fitting = [candidate for candidate in seen if not _is_hopeless(candidate, maps[id(candidate.cells)], sensor)]
+        single = self._near_rays(without_duplicates(fitting, likely, sensor))
         if not single:
             return {}
         noise = known_noise or estimate_noise(single, sensor)
@@ -490,8 +496,8 @@ class Refinement:
         disperses = sensor.dispersion > options.sensor.significant_dispersion
         fit_candidates(pool, single, [disperses] * len(single), sensor)
         self.noise_std = sensor.std
-        maps = {id(part[0].cells): DistanceMap.of(part[0].cells.occupied, part[0].cells.frame) for part in by_level(single)}
-        finished = pool.map(lambda one: finish(one, maps[id(one.cells)].background(one.bundle), sensor), single)
+        alone = [maps[id(candidate.cells)] for candidate in single]
+        finished = pool.map(lambda one, at: finish(one, at.background(one.bundle), sensor), single, alone)
         results = {id(candidate): result for candidate, result in zip(single, finished, strict=True)}
         return results if options.closed_world else self._beside_others(pool, single, results, sensor)
 
@@ -591,29 +597,63 @@ def _is_kept(result: RefinedPrimitive | None, limits: AcceptanceOptions) -> bool
     return result is not None and not result.is_other and not rejection_reason(result, limits)
 
 
+def _whole_map(cells: MapCells) -> DistanceMap:
+    """Return the distances in a map with all candidates' cells."""
+    return DistanceMap.of(cells.occupied, cells.frame)
+
+
+def _is_hopeless(candidate: Candidate, whole_map: DistanceMap, sensor: BeamModel) -> bool:
+    """Tell whether the map alone explains a candidate's rays far better than its first fit does."""
+    bundle, limits = candidate.fitted_rays, candidate.options.acceptance
+    background = whole_map.background(candidate.bundle)
+    misfit, _, _ = _compare_with_map(candidate.current, bundle, background, sensor, limits.sectors)
+    return misfit > limits.hopeless_misfit
+
+
 def without_duplicates(
-    candidates: Sequence[Candidate], preferred: Sequence[Candidate], sensor: BeamModel
+    candidates: Sequence[Candidate], likely: Sequence[Candidate], sensor: BeamModel
 ) -> list[Candidate]:
-    """Remove candidates that stand where one with a larger log-likelihood ratio does.
+    """Remove candidates that the rays speak against, and those in the place of others with a larger log ratio.
+
+    Several that stand where a single one does count together.
 
     Args:
         candidates: The fitted candidates.
-        preferred: Those whose ratio is multiplied by ``options.acceptance.preference`` for the comparison.
+        likely: Those that may occlude others, and whose ratio is multiplied by ``options.acceptance.preference`` for
+            the comparison.
         sensor: The sensor.
 
     Returns:
         The rest, largest ratio first.
     """
-    ratios = {id(candidate): log_ratio_of(candidate, candidates, sensor) for candidate in candidates}
-    for candidate in preferred:
+    ratios = {id(candidate): log_ratio_of(candidate, likely, sensor) for candidate in candidates}
+    candidates = [one for one in candidates if ratios[id(one)] > one.options.acceptance.hopeless]
+    for candidate in likely:
         if id(candidate) in ratios:
             ratios[id(candidate)] *= candidate.options.acceptance.preference
+    ordered = sorted(candidates, key=lambda candidate: -ratios[id(candidate)])
     stay: list[Candidate] = []
-    for candidate in sorted(candidates, key=lambda item: -ratios[id(item)]):
-        limit = candidate.options.acceptance.max_shared
-        if all(overlap_coefficient(candidate.current, other.current) <= limit for other in stay):
-            stay.append(candidate)
+    for candidate in ordered:
+        if _is_clear(candidate, stay):
+            parts = _apart(other for other in ordered if not _is_clear(candidate, [other]) and other is not candidate)
+            if len(parts) < 2 or sum(ratios[id(part)] for part in parts) <= ratios[id(candidate)]:
+                stay.append(candidate)
     return stay
+
+
+def _apart(candidates: Iterable[Candidate]) -> list[Candidate]:
+    """Return the first candidates that stand clear of those before them."""
+    chosen: list[Candidate] = []
+    for candidate in candidates:
+        if _is_clear(candidate, chosen):
+            chosen.append(candidate)
+    return chosen
+
+
+def _is_clear(candidate: Candidate, others: Sequence[Candidate]) -> bool:
+    """Tell whether a candidate shares little of its area with any of some others."""
+    limit = candidate.options.acceptance.max_shared
+    return all(overlap_coefficient(candidate.current, other.current) <= limit for other in others)
 
 
 def log_ratio_of(candidate: Candidate, others: Sequence[Candidate], sensor: BeamModel) -> float:

@@ -95,7 +95,7 @@ def correct_scanner_errors(
     Returns:
         The sensor: the same where no errors are found, else estimated anew.
     """
-    search = ErrorSearch(pool, candidates, candidates, candidates[0].options.scanner)
+    search = ErrorSearch(pool, candidates, _asked(candidates), candidates[0].options.scanner)
     estimated = estimate_sensor(candidates, sensor, noise_std)
     errors = ScannerErrors(mixed=mixed_pixels(candidates, candidates, estimated, search.options))
     errors = search.likeliest(estimated, errors)
@@ -123,7 +123,7 @@ def settle_scanner_errors(
     errors = candidates[0].errors
     if errors == NO_ERRORS:
         return sensor, None
-    trusted = [candidate for candidate in candidates if candidate.outline is None]
+    trusted = _asked([candidate for candidate in candidates if candidate.outline is None])
     search = ErrorSearch(pool, candidates, trusted, candidates[0].options.scanner)
     estimated = estimate_sensor(candidates, sensor, noise_std)
     if not trusted:
@@ -135,6 +135,14 @@ def settle_scanner_errors(
         return estimated, None
     std = search.add_shared_errors(estimated, errors)
     return estimated, SensorErrors(errors.range_bias, std, 2 * errors.reach, 2 * errors.mixed)
+
+
+def _asked(candidates: Sequence[Candidate]) -> list[Candidate]:
+    """Return the candidates of most rays, in their order."""
+    most = candidates[0].options.scanner.asked if candidates else 0
+    chosen = sorted(candidates, key=lambda candidate: -len(candidate.bundle))[:most]
+    numbers = {id(candidate) for candidate in chosen}
+    return [candidate for candidate in candidates if id(candidate) in numbers]
 
 
 @dataclass(frozen=True)

@@ -35,8 +35,8 @@ def ranges_of(vertices: FloatArray, bundle: RayBundle) -> FloatArray:
     Returns:
         The ranges (N,) in metres; FAR for a miss.
     """
-    ranges, clearances = np.empty(len(bundle)), np.empty(len(bundle))
-    outline_ranges(vertices, bundle.rays, ranges, clearances)
+    ranges = np.empty(len(bundle))
+    outline_ranges(vertices, bundle.rays, ranges)
     return ranges
 
 

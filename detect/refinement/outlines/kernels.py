@@ -97,22 +97,34 @@ def _intersect(vertices: Any, rays: Any, first: int, count: int, scratch: Any) -
 
 
 @kernel
-def outline_ranges(vertices: Any, rays: Any, out: Any, clearances: Any) -> None:
+def outline_ranges(vertices: Any, rays: Any, out: Any) -> None:
     """Cast rays against a closed polygon.
 
     Args:
         vertices: (V, 2) in metres.
         rays: (7, N).
         out: (N,) gets the ranges (m); FAR for a miss.
-        clearances: (N,) gets the signed distances (m) of the rays' lines from the nearer silhouette point.
     """
     scratch = np.empty((SCRATCH_ROWS, BLOCK))
+    centre_x, centre_y, reach = 0.0, 0.0, 0.0
+    for corner in range(len(vertices)):
+        centre_x, centre_y = centre_x + vertices[corner, 0], centre_y + vertices[corner, 1]
+    centre_x, centre_y = centre_x / len(vertices), centre_y / len(vertices)
+    for corner in range(len(vertices)):
+        reach = max(reach, math.hypot(vertices[corner, 0] - centre_x, vertices[corner, 1] - centre_y))
     for first in range(0, len(out), BLOCK):
         count = min(BLOCK, len(out) - first)
+        passes = False
+        for i in range(first, first + count):
+            x, y = centre_x - rays[ORIGIN_X, i], centre_y - rays[ORIGIN_Y, i]
+            passes |= abs(x * rays[DIRECTION_Y, i] - y * rays[DIRECTION_X, i]) <= reach
+        if not passes:
+            out[first : first + count] = FAR
+            continue
         _intersect(vertices, rays, first, count, scratch)
         for i in range(count):
-            clearances[first + i] = min(scratch[HIGH, i], -scratch[LOW, i]) if scratch[FARTHEST, i] > 0.0 else -FAR
-            out[first + i] = scratch[NEAREST, i] if clearances[first + i] > 0.0 else FAR
+            meets = scratch[FARTHEST, i] > 0.0 and min(scratch[HIGH, i], -scratch[LOW, i]) > 0.0
+            out[first + i] = scratch[NEAREST, i] if meets else FAR
 
 
 @kernel

@@ -326,6 +326,9 @@ def box_output(*columns: tuple[float, float, float, float, float]) -> NDArray[np
 
 GOOD = (100.0, 100.0, 30.0, 30.0, 0.9)
 
+SMALL = (0.05, 0.3)
+"""m; sizes that are looked for in cells of one size."""
+
 
 @pytest.mark.parametrize("at", range(9))
 @pytest.mark.parametrize("value", [np.inf, -np.inf, np.nan])
@@ -346,8 +349,8 @@ def test_outputs_that_are_not_finite_are_refused(tmp_path: Path, at: int, value:
 @pytest.mark.filterwarnings("error")
 def test_boxes_that_no_tile_holds_are_dropped(tmp_path: Path, bad: tuple[float, ...]) -> None:
     content = write_network(detector(box_output((*bad, 0.95), GOOD)))
-    found = Detector.load(folder_with(tmp_path, yolo=content)).detect(a_map())
-    alone = Detector.load(folder_with(tmp_path, yolo=write_network(detector(box_output(GOOD))))).detect(a_map())
+    found = Detector.load(folder_with(tmp_path, yolo=content)).detect(a_map(), SMALL)
+    alone = Detector.load(folder_with(tmp_path, yolo=write_network(detector(box_output(GOOD))))).detect(a_map(), SMALL)
     assert len(found.found) == 1
     assert found.found[0].primitive == alone.found[0].primitive and not found.rejected
 
@@ -374,9 +377,9 @@ def test_outputs_whose_shape_does_not_follow_the_batch_are_refused(tmp_path: Pat
 @pytest.mark.filterwarnings("error")
 def test_primitives_that_no_tile_holds_are_rejected(tmp_path: Path, value: float) -> None:
     files = {"yolo": write_network(detector(box_output(GOOD))), "cnn": write_network(parameters(floats(value)))}
-    found = Detector.load(folder_with(tmp_path, **files)).detect(a_map())
+    found = Detector.load(folder_with(tmp_path, **files)).detect(a_map(), SMALL)
     assert not found.found and [rejection.reason for rejection in found.rejected] == [
-        "its tile holds no such primitive"
+        "its tile holds no such primitive, or its size is looked for in other cells"
     ]
 
 
@@ -391,7 +394,7 @@ def test_the_best_detections_of_a_tile_are_kept(tmp_path: Path) -> None:
     small = parameters(floats(1, 0, 0, 0, *[0.02] * 22))
     files = {"yolo": write_network(detector(box_output(*centres))), "cnn": write_network(small)}
     detector_of_many = Detector.load(folder_with(tmp_path, **files))
-    found = detector_of_many.detect(a_map())
+    found = detector_of_many.detect(a_map(), SMALL)
     assert len(found.found) == detector_of_many.options.max_per_tile
     assert min(detection.score for detection in found.found) > max(rejection.score for rejection in found.rejected)
 

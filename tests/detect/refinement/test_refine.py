@@ -32,8 +32,8 @@ from detect.refinement.refine import (
     refine_detections,
     rejection_reason,
 )
-from detect.refinement.surroundings.lines import find_lines
 from detect.refinement.surroundings.levels import MapLevels
+from detect.refinement.surroundings.lines import find_lines
 from detect.refinement.surroundings.map_cells import MapCells, OneSidedWall, is_within
 from detect.refinement.surroundings.proposals import propose
 from mapping.grid import GridFrame, OccupancyGrid

@@ -38,7 +38,7 @@ class FakeDetector:
         self.session = session
         self.seen: list[OccupancyGrid] = []
 
-    def detect(self, grid: OccupancyGrid) -> Detections:
+    def detect(self, grid: OccupancyGrid, sizes: object, progress: object = None) -> Detections:
         self.seen.append(grid)
         crop = np.full((72, 72), 7, np.uint8)
         shifted = [replace(primitive, x=primitive.x + 0.01) for primitive in self.session.world.primitives]
