@@ -20,7 +20,8 @@ from detect.networks.weights import BATCHES, Weights, load_weight_set
 from detect.networks.yolo import KINDS, Boxes, Yolo, box_iou, non_maximum_suppression
 from mapping.grid import GridFrame, OccupancyGrid
 from mapping.morphology import isolated_boxes
-from mapping.pyramid import DEFAULT_SIZES, ROUNDING, SEEN_CELLS, coarser, levels_for
+from mapping.pyramid import DEFAULT_SIZES, coarser, levels_for
+from mapping.pyramid import DEFAULTS as PYRAMID
 from prim.metrics import overlap_coefficient, polygon_iou
 from prim.world import Bounds
 
@@ -412,7 +413,7 @@ def _tiles_of_things(grid: OccupancyGrid) -> Iterator[GridFrame]:
     if max(grid.frame.shape) <= TILE_SIZE:
         yield from tile_frames(grid.frame) if occupied.any() else ()
         return
-    things = isolated_boxes(occupied, round(SEEN_CELLS))
+    things = isolated_boxes(occupied, round(PYRAMID.seen_cells))
     while len(things):
         tile = tile_around(things[0], grid.frame)
         yield tile
@@ -429,7 +430,7 @@ def _is_inside(boxes: NDArray[np.intp], tile: GridFrame, frame: GridFrame) -> ND
 
 def _scaled(found: Detections, scale: float) -> Detections:
     """Return detections in a map whose cells are so many times as large."""
-    if math.isclose(scale, 1, rel_tol=ROUNDING):
+    if math.isclose(scale, 1, rel_tol=PYRAMID.rounding):
         return found
 
     def larger(detection: Detection) -> Detection:

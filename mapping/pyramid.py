@@ -15,21 +15,30 @@ from mapping.grid import UNKNOWN, GridFrame, OccupancyGrid
 DEFAULT_SIZES = (0.05, 2.0)
 """The smallest and the largest object that is looked for (m), by its longest side or its diameter."""
 
-SEEN_CELLS = 48.0
-"""Things of up to so many cells across are looked for at a level; those that are larger at the next, in cells twice
-as large. The paper's largest square, 0.32 m in cells of 1 cm, is 45 across."""
-
-FEWEST_CELLS = 5.0
-"""Things that are seen in fewer cells have no shape."""
-
 Slices = tuple[slice, slice]
-
-ROUNDING = 1e-6
-"""Relative rounding errors of resolutions."""
 
 
 @dataclass(frozen=True)
-class Level:
+class PyramidOptions:
+    """Which things are looked for in cells of which size.
+
+    Attributes:
+        seen_cells: Things of up to so many cells across are looked for at a level; those that are larger at the next,
+            in cells twice as large. The paper's largest square, 0.32 m in cells of 1 cm, is 45 across.
+        fewest_cells: Things that are seen in fewer cells have no shape; set by hand.
+        rounding: Relative rounding errors of resolutions.
+    """
+
+    seen_cells: float = 48.0
+    fewest_cells: float = 5.0
+    rounding: float = 1e-6
+
+
+DEFAULTS = PyramidOptions()
+
+
+@dataclass(frozen=True)
+class PyramidLevel:
     """One size of a map's cells.
 
     Attributes:
@@ -43,25 +52,28 @@ class Level:
     extents: tuple[float, float]
 
 
-def levels_for(resolution: float, sizes: tuple[float, float]) -> tuple[Level, ...]:
+def levels_for(
+    resolution: float, sizes: tuple[float, float], options: PyramidOptions = DEFAULTS
+) -> tuple[PyramidLevel, ...]:
     """Choose the levels at which a map shows things of all sizes that are wanted.
 
     Args:
         resolution: The side of the map's cells (m).
         sizes: The smallest and the largest size (m): the longest side, or the diameter.
+        options: Numeric parameters.
 
     Returns:
         The levels, the finest first, each with cells of twice the size of the one before.
     """
     smallest, largest = sizes
     factor = 1
-    while 2 * factor * resolution * FEWEST_CELLS <= smallest * (1 + ROUNDING):
+    while 2 * factor * resolution * options.fewest_cells <= smallest * (1 + options.rounding):
         factor *= 2
     widest, lower = largest * np.sqrt(2), 0.0
-    levels: list[Level] = []
-    while not levels or lower < widest * (1 - ROUNDING):
-        upper = SEEN_CELLS * factor * resolution
-        levels.append(Level(factor, factor * resolution, (lower, upper)))
+    levels: list[PyramidLevel] = []
+    while not levels or lower < widest * (1 - options.rounding):
+        upper = options.seen_cells * factor * resolution
+        levels.append(PyramidLevel(factor, factor * resolution, (lower, upper)))
         factor, lower = 2 * factor, upper
     return tuple(levels)
 

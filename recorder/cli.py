@@ -62,7 +62,8 @@ def record(
     ] = 0,
     world: Annotated[Path | None, typer.Option(metavar="WORLD.json", help="Read the world from this file.")] = None,
     size: Annotated[
-        tuple[float, float] | None, typer.Option(metavar="X Y", help="Size of the floor, metres. [default: 2 2]")
+        tuple[float, float] | None,
+        typer.Option("--arena", "--size", metavar="X Y", help="Size of the floor, metres. [default: 2 2]"),
     ] = None,
     walls: Annotated[
         bool | None, typer.Option("--walls/--no-walls", help="A wall along each edge of the floor. [default: walls]")
@@ -73,6 +74,13 @@ def record(
     per_kind: Annotated[
         str | None,
         typer.Option(metavar="N or A-B", help="How many of each kind: a number or a range. [default: 0-2]"),
+    ] = None,
+    sizes: Annotated[
+        tuple[float, float] | None,
+        typer.Option(
+            metavar="MIN MAX",
+            help="Primitives and clutter of these extents, all scales alike. [default: 0.05 to 0.32 m]",
+        ),
     ] = None,
     clutter: Annotated[
         str | None,
@@ -158,6 +166,7 @@ def record(
         walls=walls,
         kinds=kinds,
         per_kind=_parse_counts("--per-kind", per_kind),
+        sizes=sizes,
         clutter=_parse_counts("--clutter", clutter),
         room=room,
         at_walls=at_walls,

@@ -44,12 +44,13 @@ LARGEST = {
     "at_walls": 1e3,
     "stops": 1e5,
     "size": MAX_LENGTH,
+    "sizes": 1e3,
     "range_min": MAX_LENGTH,
     "range_max": MAX_LENGTH,
 }
 """The largest value of each option (m, rad, m/s, or a number); set by hand."""
 
-SMALLEST = {"size": 1e-2, "speed": 1e-4}
+SMALLEST = {"size": 1e-2, "sizes": 1e-2, "speed": 1e-4}
 """The smallest value of options (m, m/s) that else need only be above 0; set by hand."""
 
 MAX_BEAM_WIDTH = math.radians(30)
@@ -87,6 +88,8 @@ class RecordingKeywords(TypedDict, total=False):
     """The kinds of primitives to draw: a list, or separated by commas; or «all»."""
     per_kind: int | tuple[int, int] | None
     """How many of each kind: a number, or fewest and most."""
+    sizes: tuple[float, float] | None
+    """The smallest and the largest extent of primitives and clutter, by longest side or diameter, all scales alike."""
     clutter: int | tuple[int, int] | None
     """How many things that are none of the kinds: a number, or fewest and most."""
     room: Sequence[str] | str | None
@@ -215,6 +218,11 @@ def _check_walls(given: Mapping[str, Any]) -> None:
     """Raise UsageError where a world is to be drawn that cannot be."""
     if given.get("at_walls") is not None and given.get("touching"):
         raise UsageError("--at-walls and --touching exclude each other")
+    smallest, largest = given.get("sizes", (1.0, 1.0))
+    if not smallest <= largest:
+        raise UsageError(
+            f"--sizes is {smallest:g} {largest:g}: give the smaller one first: --sizes {largest:g} {smallest:g}"
+        )
     for name in ("room", "at_walls"):
         if name in given and given.get("walls") is False:
             raise UsageError(f"{_option(name)} does not go with --no-walls")
@@ -301,10 +309,10 @@ def _counts(name: str, counts: int | tuple[int, int]) -> tuple[int, int]:
 
 
 def _option(name: str) -> str:
-    return f"--{name.replace('_', '-')}"
+    return "--arena" if name == "size" else f"--{name.replace('_', '-')}"
 
 
-_DRAWN = ("size", "walls", "kinds", "per_kind", "clutter", "room", "at_walls", "touching")
+_DRAWN = ("size", "walls", "kinds", "per_kind", "sizes", "clutter", "room", "at_walls", "touching")
 _DRIVEN = ("duration", "speed", "movable", "odom_noise")
 _WARPED = ("stops",)
 _LIDAR = ("rays", "fov", "range_min", "range_max", "noise_std")
@@ -314,7 +322,7 @@ _FAULTS = {
 }
 """The fields of the scanner's faults by the names of their parameters."""
 _DIRECT = ("seed", "motion", "stops", "duration", "speed", "movable", "rate")
-_POSITIVE = ("size", "stops", "duration", "speed", "rate", "rays", "fov", "range_max")
+_POSITIVE = ("size", "sizes", "stops", "duration", "speed", "rate", "rays", "fov", "range_max")
 _NOT_NEGATIVE = (
     "range_min",
     "noise",

@@ -169,7 +169,7 @@ class Explorer:
             x0, y0, x1, y1 = self._simulator.world.bounds
             larger = " ".join(f"{max(2 * side, max(USUAL_FLOOR)):g}" for side in (x1 - x0, y1 - y0))
             raise UsageError(
-                f"the robot finds no room to drive: give --size {larger} or fewer primitives, or a roomier --world"
+                f"the robot finds no room to drive: give --arena {larger} or fewer primitives, or a roomier --world"
             )
         cells = sorted(self._free)
         for index in self._rng.permutation(len(cells)):
@@ -249,7 +249,7 @@ class Explorer:
             longest = (math.isqrt(self._options.max_cells) - 2) * cell  # two cells reach beyond the edges
             smaller = " ".join(f"{min(side, longest):g}" for side in (x1 - x0, y1 - y0))
             raise UsageError(
-                f"a floor of {x1 - x0:g} x {y1 - y0:g} m is too large to drive on: give --size {smaller} or less, "
+                f"a floor of {x1 - x0:g} x {y1 - y0:g} m is too large to drive on: give --arena {smaller} or less, "
                 "or a smaller --world"
             )
         return {(row, col) for row in rows for col in cols if self._has_room(*self._centre((row, col)))}

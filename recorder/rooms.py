@@ -131,7 +131,8 @@ def draw_room(
         if name in elements and not site.build(build):
             larger = " ".join(f"{math.ceil(max(2 * length, 2)):d}" for length in size)
             raise UsageError(
-                f"--room {name} finds no place on {size[0]:g} x {size[1]:g} m: give --size {larger} or fewer elements"
+                f"--room {name} finds no place on {size[0]:g} x {size[1]:g} m: "
+                f"give --arena {larger} or fewer elements"
             )
     return Room(tuple(site.structure), tuple(site.walls))
 

@@ -251,7 +251,7 @@ _ONLY_FOR = {"warp": ("stops",), "drive": ("duration", "speed", "movable", "odom
 _UNLESS_DEFAULT = ("simulator", "explorer", "placement")
 """Options that are described only where they are not the defaults."""
 
-_NEWER_WORLD_OPTIONS = ("clutter", "room", "at_walls", "touching")
+_NEWER_WORLD_OPTIONS = ("clutter", "room", "at_walls", "touching", "sizes")
 """Options of a drawn world that are described only where they are not the defaults."""
 
 _SIMULATOR_KEYS = {"track_width": "axle"}

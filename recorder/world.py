@@ -68,6 +68,9 @@ THINNEST = 0.8
 AMPLE_SPACING = 0.6
 """Primitives that have squares of this side (m) on average find places; set by hand."""
 
+SPACING_OF_SIZES = 2.0
+"""The same as a multiple of their largest extent, where one is given: most are smaller."""
+
 
 def draw_world(
     rng: np.random.Generator,
@@ -124,8 +127,9 @@ def _larger_floor(options: WorldOptions) -> str:
     """Return the option that makes the floor, enlarged in its form, large enough for all that is drawn."""
     width, height = options.size
     most = options.per_kind[1] * len(options.kinds) + options.clutter[1]
-    growth = AMPLE_SPACING * math.sqrt(most / (width * height)) * (2 if options.room else 1)
-    return "--size " + " ".join(f"{math.ceil(max(growth * side, AMPLE_SPACING, side))}" for side in options.size)
+    spacing = AMPLE_SPACING if options.sizes is None else SPACING_OF_SIZES * options.sizes[1]
+    growth = spacing * math.sqrt(most / (width * height)) * (2 if options.room else 1)
+    return "--arena " + " ".join(f"{math.ceil(max(growth * side, spacing, side))}" for side in options.size)
 
 
 def _place(

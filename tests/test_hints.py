@@ -79,17 +79,17 @@ class Recording(NamedTuple):
 QUICK = "a.mcap --rays 20 "
 RECORDINGS = {
     "no room to drive": Recording(
-        "the robot finds no room to drive: give", QUICK + "--motion drive --duration 1 --per-kind 0 --size 0.1 0.1"
+        "the robot finds no room to drive: give", QUICK + "--motion drive --duration 1 --per-kind 0 --arena 0.1 0.1"
     ),
     "crowded": Recording(
         "the robot finds no room to drive: give",
-        QUICK + "--motion drive --duration 1 --per-kind 1 --size 0.4 0.4 --kinds square",
+        QUICK + "--motion drive --duration 1 --per-kind 1 --arena 0.4 0.4 --kinds square",
     ),
     "many primitives": Recording("do not fit on", QUICK + "--per-kind 40 --stops 2 2"),
-    "a small floor": Recording("do not fit on", QUICK + "--per-kind 1 --stops 2 2 --size 0.1 3"),
+    "a small floor": Recording("do not fit on", QUICK + "--per-kind 1 --stops 2 2 --arena 0.1 3"),
     "much clutter": Recording("do not fit on", QUICK + "--per-kind 0 --clutter 100 --stops 2 2"),
-    "a small room": Recording("finds no place on", QUICK + "--per-kind 0 --room furniture --size 0.1 0.1"),
-    "a crowded room": Recording("do not fit on", QUICK + "--per-kind 4 --room L --size 1 1"),
+    "a small room": Recording("finds no place on", QUICK + "--per-kind 0 --room furniture --arena 0.1 0.1"),
+    "a crowded room": Recording("do not fit on", QUICK + "--per-kind 4 --room L --arena 1 1"),
 }
 
 

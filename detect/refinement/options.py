@@ -354,6 +354,14 @@ class MapOptions:
     """m; occupied cells around a candidate that are its own, before it is fitted."""
     cleared: float = scaled(0.02)
     """m; and afterwards."""
+    shown_cells: float = 71.0
+    """Cells across the largest thing that numbers hold for: a square of 0.5 m in cells of 1 cm, or two of 0.25 m that
+    touch. Larger ones are seen in coarser cells."""
+    reference: float = 0.01
+    """m; the side of the cells that all numbers are written for."""
+    max_hollow: float = 0.6
+    """Share of the cells within a component's rectangle that are free, above which it is a room or a part of one; of
+    components that are too large for the map's own cells."""
     blur: float = scaled(0.1)
     """m; noise blurs a primitive so far into the map: connected cells this near are its own."""
 
@@ -450,8 +458,6 @@ class AcceptanceOptions:
     """nats; log-likelihood ratio of the rays against nothing in its place."""
     hopeless: float = 0.0
     """nats; after the first fits, to some of the rays, candidates with less are given up."""
-    hopeless_misfit: float = 1.0
-    """nats a ray; so are those whose rays the map alone explains better by more."""
     max_misfit: float = 0.25
     """nats a ray; by which the map alone explains the rays that meet it better."""
     max_relative_std: float = 0.25

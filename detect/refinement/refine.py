@@ -206,9 +206,7 @@ def refine_detections(
     return Detections(tuple(kept), tuple(rejected), objects=tuple(objects), sensor=refinement.sensor), noise
 
 
-def _candidates_of(
-    detections: Detections, levels: MapLevels, effort: Effort
-) -> tuple[list[Detection], set[int]]:
+def _candidates_of(detections: Detections, levels: MapLevels, effort: Effort) -> tuple[list[Detection], set[int]]:
     """Return what is to be refined, detections first, and the ids of proposals and detections of low score."""
     warm_start = effort.warm_start
     if warm_start:
@@ -261,12 +259,14 @@ def rejection_reason(result: RefinedPrimitive | None, limits: AcceptanceOptions 
         The reason; empty where they do not.
     """
     if result is None:
-        return "the rays speak against it, a likelier one stands in its place, or it is too large or reaches into a wall"
+        return (
+            "the rays speak against it, a likelier one stands in its place, or it is too large or reaches into a wall"
+        )
     if result.log_ratio < limits.min_log_ratio:
         return (
             f"the rays are likelier with it by {result.log_ratio:.0f} nats only, less than {limits.min_log_ratio:g}"
         )
-    if result.misfit > limits.max_misfit:
+    if result.misfit > limits.max_misfit and not result.is_other:
         better = f"{result.misfit:.2f} nats each in the map alone, more than {limits.max_misfit:g}"
         return f"its rays are likelier by {better}"
     sizes = result.primitive.sizes
@@ -483,9 +483,7 @@ class Refinement:
         others = [candidate for candidate in seen if not any(candidate is one for one in likely)]
         fit_candidates(pool, likely, [True] * len(likely), sensor)
         fit_candidates(pool, others, [True] * len(others), sensor, likely)
-        maps = {id(part[0].cells): _whole_map(part[0].cells) for part in by_level(seen)}
-        fitting = [candidate for candidate in seen if not _is_hopeless(candidate, maps[id(candidate.cells)], sensor)]
-        single = self._near_rays(without_duplicates(fitting, likely, sensor))
+        single = self._near_rays(without_duplicates(seen, likely, sensor))
         if not single:
             return {}
         noise = known_noise or estimate_noise(single, sensor)
@@ -496,6 +494,8 @@ class Refinement:
         disperses = sensor.dispersion > options.sensor.significant_dispersion
         fit_candidates(pool, single, [disperses] * len(single), sensor)
         self.noise_std = sensor.std
+        levels = [part[0].cells for part in by_level(single)]
+        maps = {id(cells): DistanceMap.of(cells.occupied, cells.frame) for cells in levels}
         alone = [maps[id(candidate.cells)] for candidate in single]
         finished = pool.map(lambda one, at: finish(one, at.background(one.bundle), sensor), single, alone)
         results = {id(candidate): result for candidate, result in zip(single, finished, strict=True)}
@@ -542,7 +542,7 @@ class Refinement:
     ) -> dict[int, RefinedPrimitive | None]:
         """Hold results against «none of the kinds»: shapes of their own first, then parts of something larger."""
         limits, other = self.options.acceptance, self.options.other
-        asked = [one for one in candidates if one.known is None and not rejection_reason(results[id(one)], limits)]
+        asked = [one for one in candidates if one.known is None and _may_be_something(results[id(one)], limits)]
         found = pool.map(lambda one: free_alternatives(one, one.fitted_rays, candidates, sensor), asked)
         shapes = {id(one): alternatives for one, alternatives in zip(asked, found, strict=True)}
         beside = dict(results)
@@ -592,22 +592,14 @@ def _required(result: RefinedPrimitive | None) -> RefinedPrimitive:
     return result
 
 
+def _may_be_something(result: RefinedPrimitive | None, limits: AcceptanceOptions) -> bool:
+    """Tell whether nothing speaks against a result but that it does not fit the rays well: it may be of no kind."""
+    return result is not None and not rejection_reason(replace(result, misfit=0.0), limits)
+
+
 def _is_kept(result: RefinedPrimitive | None, limits: AcceptanceOptions) -> bool:
     """Tell whether a result is one of the kinds, and nothing speaks against it."""
     return result is not None and not result.is_other and not rejection_reason(result, limits)
-
-
-def _whole_map(cells: MapCells) -> DistanceMap:
-    """Return the distances in a map with all candidates' cells."""
-    return DistanceMap.of(cells.occupied, cells.frame)
-
-
-def _is_hopeless(candidate: Candidate, whole_map: DistanceMap, sensor: BeamModel) -> bool:
-    """Tell whether the map alone explains a candidate's rays far better than its first fit does."""
-    bundle, limits = candidate.fitted_rays, candidate.options.acceptance
-    background = whole_map.background(candidate.bundle)
-    misfit, _, _ = _compare_with_map(candidate.current, bundle, background, sensor, limits.sectors)
-    return misfit > limits.hopeless_misfit
 
 
 def without_duplicates(

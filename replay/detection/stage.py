@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 from detect.networks.weights import WeightsError, shipped_weights
 from mapping.grid import GridFrame, OccupancyGrid
 from mapping.mapper import Mapper, make_mapper, takes_noise
-from mapping.pyramid import FEWEST_CELLS, ROUNDING
+from mapping.pyramid import DEFAULTS as PYRAMID
 from prim.choices import SensorModelName
 from prim.errors import UsageError
 from prim.metrics import DetectionErrors, detection_errors
@@ -315,16 +315,15 @@ def _resolution(options: ReplayOptions, frame: GridFrame) -> float:
 
     A large map is not made twice: there only what its own cells show is found.
     """
-    needed = options.sizes[0] / FEWEST_CELLS
-    if options.resolution <= needed * (1 + ROUNDING):
+    needed = options.sizes[0] / PYRAMID.fewest_cells
+    if options.resolution <= needed * (1 + PYRAMID.rounding):
         return options.resolution
     width, height = frame.cols * frame.resolution, frame.rows * frame.resolution
     return needed if width * height / needed**2 <= FINE_CELLS else options.resolution
 
 
 def _own_mapper(options: ReplayOptions, frame: GridFrame) -> Mapper | None:
-    """Make a mapper whose cells show what is wanted, with the sensor model of training; None where the replay's does.
-    """
+    """Make a mapper of what the detector reads, with the sensor model of training; None where the replay's does."""
     if _resolution(options, frame) == options.resolution and options.sensor_model == "eq4":
         return None
     return _detectors_mapper(options, frame)

@@ -3,7 +3,8 @@
 The evidence is the likelihood integrated over the prior: a square that explains the rays as well as a rectangle does
 is the likelier kind, since it has a size less to choose (Occam's factor; MacKay 2003, chapter 28). The prior is
 scale-free over sizes, uniform over angles, equal for all kinds, and flat over positions, which cancels in ratios.
-Where scans have common errors the log-likelihood is divided by the dispersion (a power likelihood; Bissiri, Holmes and Walker 2016).
+Where scans have common errors the log-likelihood is divided by the dispersion (a power likelihood; Bissiri, Holmes
+and Walker 2016).
 
 The evidence is first approximated by Laplace's method, and for the contenders computed by adaptive importance
 sampling from Student's t. The samples of the last round, with tempered weights, give the posterior mean and

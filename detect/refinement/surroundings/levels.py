@@ -9,14 +9,8 @@ from functools import cached_property
 from detect.refinement.options import DEFAULTS, RefinementOptions
 from detect.refinement.surroundings.map_cells import MapCells
 from mapping.grid import OccupancyGrid
-from mapping.pyramid import Level, coarser, levels_for
+from mapping.pyramid import PyramidLevel, coarser, levels_for
 from prim.shapes import Primitive
-
-REFERENCE_RESOLUTION = 0.01
-"""m; the side of the cells that the numbers of refinement are written for."""
-
-SHOWN_CELLS = 71.0
-"""Cells across the largest thing that the numbers hold for: a square of 0.5 m, or two of 0.25 m that touch."""
 
 
 @dataclass(frozen=True)
@@ -29,7 +23,7 @@ class MapLevel:
         options: Numbers for these things.
     """
 
-    level: Level
+    level: PyramidLevel
     grid: OccupancyGrid
     options: RefinementOptions
 
@@ -65,7 +59,7 @@ class MapLevels:
         made, factor = [], 1
         for level in levels_for(grid.frame.resolution, options.evidence.sizes):
             grid, factor = coarser(grid, level.factor // factor), level.factor
-            made.append(MapLevel(level, grid, options.at_scale(level.resolution / REFERENCE_RESOLUTION)))
+            made.append(MapLevel(level, grid, options.at_scale(level.resolution / options.map.reference)))
         return cls(tuple(made), options)
 
     def __iter__(self) -> Iterator[MapLevel]:
@@ -74,5 +68,5 @@ class MapLevels:
     def showing(self, primitive: Primitive) -> MapLevel:
         """Return the finest level at which the numbers hold for a thing of a primitive's extent."""
         extent = 2 * primitive.bounding_radius
-        shown = (one for one in self.levels if extent <= SHOWN_CELLS * one.level.resolution)
+        shown = (one for one in self.levels if extent <= self.options.map.shown_cells * one.level.resolution)
         return next(shown, self.levels[-1])

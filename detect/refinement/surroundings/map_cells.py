@@ -162,6 +162,12 @@ class MapCells:
         """
         return _cells_around(self.frame, primitive, reach)
 
+    def is_hollow(self, primitive: Primitive) -> bool:
+        """Tell whether most of what lies within a primitive is free: a room is, or a part of one."""
+        rows, cols, points = _cells_around(self.frame, primitive, primitive.bounding_radius)
+        inside = is_within(primitive, points, 0.0)
+        return bool(self.free[rows, cols][inside].mean() > self.options.max_hollow) if inside.any() else False
+
     def is_behind_wall(self, primitive: Primitive) -> bool:
         """Tell whether a primitive reaches behind a wall that is free on one side only."""
         outline, penetration = primitive.outline(OUTLINE_POINTS), self.options.penetration

@@ -35,7 +35,9 @@ def propose(levels: MapLevels, known: Sequence[Primitive], max_proposals: int | 
     made: list[Primitive] = []
     for level in levels:
         proposed = _propose_at(level.cells, [*known, *made], max_proposals, level.options.proposals)
-        made += [around for around in proposed if levels.showing(around) is level]
+        shown = [around for around in proposed if levels.showing(around) is level]
+        is_finest = level is levels.levels[0]
+        made += [around for around in shown if is_finest or not level.cells.is_hollow(around)]
     return made
 
 

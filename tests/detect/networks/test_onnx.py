@@ -350,7 +350,9 @@ def test_outputs_that_are_not_finite_are_refused(tmp_path: Path, at: int, value:
 def test_boxes_that_no_tile_holds_are_dropped(tmp_path: Path, bad: tuple[float, ...]) -> None:
     content = write_network(detector(box_output((*bad, 0.95), GOOD)))
     found = Detector.load(folder_with(tmp_path, yolo=content)).detect(a_map(), SMALL)
-    alone = Detector.load(folder_with(tmp_path, yolo=write_network(detector(box_output(GOOD))))).detect(a_map(), SMALL)
+    alone = Detector.load(folder_with(tmp_path, yolo=write_network(detector(box_output(GOOD))))).detect(
+        a_map(), SMALL
+    )
     assert len(found.found) == 1
     assert found.found[0].primitive == alone.found[0].primitive and not found.rejected
 

@@ -223,7 +223,7 @@ def test_doubtful_detections_are_decided_by_the_rays(
     assert any(polygon_iou(one.primitive, world.primitives[0]) > 0.97 for one in refined.found)
     assert rejection not in refined.rejected and other not in refined.rejected
     judged = [one for one in refined.rejected if "not detected by the networks" in one.reason and one.y == -0.7]
-    assert len(judged) == 1 and (judged[0].fitted is None) == ("no ray passes it" in judged[0].reason)
+    assert len(judged) == 1 and (judged[0].fitted is None) == ("the rays speak against it" in judged[0].reason)
 
 
 @pytest.mark.parametrize("kind", [Kind.CIRCLE, Kind.SQUARE, Kind.ELLIPSE])

@@ -191,7 +191,8 @@ def test_what_moves_is_refined_and_judged_with_the_options_of_the_replay(monkeyp
         call = getattr(module, name)
 
         def watch(*arguments: Any) -> Any:
-            given.append((name, [one.closed_world for one in arguments if isinstance(one, RefinementOptions)]))
+            options = [one.options if isinstance(one, MapLevels) else one for one in arguments]
+            given.append((name, [one.closed_world for one in options if isinstance(one, RefinementOptions)]))
             return call(*arguments)
 
         monkeypatch.setattr(module, name, watch)

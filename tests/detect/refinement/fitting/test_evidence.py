@@ -18,8 +18,8 @@ from detect.refinement.fitting.evidence import (
     importance_sample,
     laplace_evidence,
     log_prior,
-    max_size,
     mixture,
+    size_bounds,
 )
 from detect.refinement.fitting.fit import SPECIAL_CASES, KindFit, distinct_modes, nearest_name
 from detect.refinement.likelihood.geometry import JACOBIANS, primitive_of
@@ -33,16 +33,23 @@ from prim.shapes import Kind, Primitive
 def test_the_prior_is_a_density_over_the_shapes(kind: Kind) -> None:
     """It integrates to 1 over the parameters that are canonical: each shape has one name."""
     rng, count = np.random.default_rng(0), 20_000
-    limit = max_size(kind, DEFAULTS.evidence)
+    options = replace(DEFAULTS.evidence, max_extent=1e3)
+    lower, upper = np.log(size_bounds(kind, options))
     turns = 2 * math.pi if kind.has_angle else 1.0
-    sizes = rng.uniform(0, limit, (count, len(kind.sizes)))
+    sizes = np.exp(rng.uniform(lower, upper, (count, len(kind.sizes))))
     angles = rng.uniform(0, 2 * math.pi, count)
-    canonical = 0
-    for size, theta in zip(sizes.tolist(), angles.tolist(), strict=True):
+    canonical = np.zeros(count, np.bool_)
+    for number, (size, theta) in enumerate(zip(sizes.tolist(), angles.tolist(), strict=True)):
         named = Primitive(kind, 0.0, 0.0, theta if kind.has_angle else None, tuple(size))
-        canonical += (named.canonical().theta, named.canonical().size) == (named.theta, named.size)
-    volume = turns * limit ** len(kind.sizes) * canonical / count
-    assert math.exp(log_prior(kind)) * volume == pytest.approx(1.0, abs=0.05)
+        canonical[number] = (named.canonical().theta, named.canonical().size) == (named.theta, named.size)
+    drawn = 1 / (turns * (sizes * (upper - lower)).prod(axis=1))
+    assert (np.exp(log_prior(kind, sizes, options)) / drawn)[canonical].sum() / count == pytest.approx(1.0, abs=0.05)
+
+
+def test_the_prior_of_sizes_has_no_scale() -> None:
+    """Ten times the size has a tenth of the density, for each size."""
+    small, large = (log_prior(Kind.RECTANGLE, np.array([size, size / 2])) for size in (0.05, 0.5))
+    assert float(small - large) == pytest.approx(2 * math.log(10))
 
 
 @pytest.mark.parametrize(("kind", "special"), SPECIAL_CASES.items())
@@ -72,7 +79,8 @@ def test_evidence_is_finite_however_much_the_rays_say_of_one_direction(largest: 
         values = np.array([largest, 1e5, 1.0, 0.0])
         information = (axes * values) @ axes.T
         fit = KindFit(Kind.SQUARE, np.array([3.6, 2.5, 0.3, 0.05, 0.05]), 634.0, information)
-        expected = -634.0 + 2 * math.log(2 * math.pi) - np.log(values + 1).sum() / 2 + log_prior(Kind.SQUARE)
+        expected = -634.0 + 2 * math.log(2 * math.pi) - np.log(values + 1).sum() / 2
+        expected += float(log_prior(Kind.SQUARE, fit.p[3:4]))
         assert laplace_evidence(fit) == pytest.approx(
             expected, abs=8.0
         )  # half of what rounding hides: ln 1e7 at most
