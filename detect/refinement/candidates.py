@@ -34,7 +34,6 @@ from detect.refinement.surroundings.map_cells import MapCells, is_within
 from detect.refinement.surroundings.walls import Wall, walls_behind
 from detect.refinement.wall_surfaces import measure_walls, sharpen
 from prim.arrays import BoolGrid, FloatArray
-from prim.metrics import overlap_coefficient
 from prim.shapes import Primitive
 
 
@@ -57,6 +56,7 @@ class Candidate:
         shared_errors: (5, E) by how much its parameters change with one standard deviation of each error of the
             scanner; None for none.
         outline: Vertices (V, 2) in m of a free outline, where the rays say that no kind fits; else None.
+        rivals: Candidates that would stand in its place, and do not occlude it.
         current: The primitive as far as it is known.
     """
 
@@ -73,9 +73,10 @@ class Candidate:
     errors: ScannerErrors = NO_ERRORS
     shared_errors: FloatArray | None = None
     outline: FloatArray | None = None
+    rivals: list[Candidate] = field(default_factory=list)
     current: Primitive = field(init=False)
     _cached: tuple[Background, tuple[float, float], FloatArray] | None = None
-    _passed: dict[int, bool] = field(default_factory=dict)
+    _passed: dict[int, tuple[Candidate, bool]] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         self.current = self.start
@@ -114,15 +115,13 @@ class Candidate:
         return with_background(self.bundle, background, self._cached[2], [*shapes, *walls], sensor, occlusion)
 
     def _may_be_occluded_by(self, other: Candidate) -> bool:
-        """Tell whether some of its rays pass another candidate where that was first, or nearby; it is asked once.
-
-        What would stand in its own place is a rival, and does not occlude it.
-        """
-        if id(other) not in self._passed:
-            is_rival = overlap_coefficient(self.start, other.start) > self.options.acceptance.max_shared
-            passes = self.bundle.passing(other.start, other.options.rays.reach).any()
-            self._passed[id(other)] = bool(passes and not is_rival)
-        return self._passed[id(other)]
+        """Tell whether some of its rays pass another candidate where that was first, or nearby; it is asked once."""
+        known = self._passed.get(id(other))
+        if known is None or known[0] is not other:
+            is_rival = any(other is rival for rival in self.rivals)
+            passes = bool(self.bundle.passing(other.start, other.options.rays.reach).any())
+            self._passed[id(other)] = known = other, passes and not is_rival
+        return known[1]
 
     def keep_rays(self, chosen: NDArray[np.bool_]) -> None:
         """Leave out all rays but the chosen ones (N,)."""

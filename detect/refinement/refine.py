@@ -429,6 +429,7 @@ class Refinement:
             Candidate(start, bundle, level.cells, detections.get(number), level.options)
             for number, (start, bundle, level) in enumerate(zip(primitives, bundles, shown, strict=False))
         ]
+        _find_rivals(candidates[:preferred])
         for site in sites:
             site.take(candidates)
         seen = [candidate for candidate in candidates if len(candidate.bundle) and not candidate.holds_laser()]
@@ -479,11 +480,8 @@ class Refinement:
         find_backgrounds(pool, seen, is_first=True)
         dropouts = estimate_dropouts(seen, noise, options.sensor)
         sensor = BeamModel.create(noise, span, max_std=max_noise, options=options.sensor, dropout_share=dropouts)
-        likely = [candidate for candidate in seen if any(candidate is one for one in preferred)]
-        others = [candidate for candidate in seen if not any(candidate is one for one in likely)]
-        fit_candidates(pool, likely, [True] * len(likely), sensor)
-        fit_candidates(pool, others, [True] * len(others), sensor, likely)
-        single = self._near_rays(without_duplicates(seen, likely, sensor))
+        fit_candidates(pool, seen, [True] * len(seen), sensor)
+        single = self._near_rays(without_duplicates(seen, preferred, sensor))
         if not single:
             return {}
         noise = known_noise or estimate_noise(single, sensor)
@@ -603,34 +601,39 @@ def _is_kept(result: RefinedPrimitive | None, limits: AcceptanceOptions) -> bool
 
 
 def without_duplicates(
-    candidates: Sequence[Candidate], likely: Sequence[Candidate], sensor: BeamModel
+    candidates: Sequence[Candidate], preferred: Sequence[Candidate], sensor: BeamModel
 ) -> list[Candidate]:
-    """Remove candidates that the rays speak against, and those in the place of others with a larger log ratio.
-
-    Several that stand where a single one does count together.
+    """Remove candidates that stand where one with a larger log-likelihood ratio does, or several rivals together have.
 
     Args:
         candidates: The fitted candidates.
-        likely: Those that may occlude others, and whose ratio is multiplied by ``options.acceptance.preference`` for
-            the comparison.
+        preferred: Those whose ratio is multiplied by ``options.acceptance.preference`` for the comparison.
         sensor: The sensor.
 
     Returns:
         The rest, largest ratio first.
     """
-    ratios = {id(candidate): log_ratio_of(candidate, likely, sensor) for candidate in candidates}
-    candidates = [one for one in candidates if ratios[id(one)] > one.options.acceptance.hopeless]
-    for candidate in likely:
+    ratios = {id(candidate): log_ratio_of(candidate, candidates, sensor) for candidate in candidates}
+    for candidate in preferred:
         if id(candidate) in ratios:
             ratios[id(candidate)] *= candidate.options.acceptance.preference
     ordered = sorted(candidates, key=lambda candidate: -ratios[id(candidate)])
     stay: list[Candidate] = []
     for candidate in ordered:
         if _is_clear(candidate, stay):
-            parts = _apart(other for other in ordered if not _is_clear(candidate, [other]) and other is not candidate)
+            parts = _apart(other for other in ordered if any(other is rival for rival in candidate.rivals))
             if len(parts) < 2 or sum(ratios[id(part)] for part in parts) <= ratios[id(candidate)]:
                 stay.append(candidate)
     return stay
+
+
+def _find_rivals(candidates: Sequence[Candidate]) -> None:
+    """Make those of the networks' candidates rivals that would stand in each other's place."""
+    for number, candidate in enumerate(candidates):
+        for other in candidates[:number]:
+            if overlap_coefficient(candidate.start, other.start) > candidate.options.acceptance.max_shared:
+                candidate.rivals.append(other)
+                other.rivals.append(candidate)
 
 
 def _apart(candidates: Iterable[Candidate]) -> list[Candidate]:
