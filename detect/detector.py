@@ -116,7 +116,12 @@ Progress = Callable[[int, int], None]
 
 
 def no_progress(done: int, total: int) -> None:
-    """Report nothing."""
+    """Report nothing.
+
+    Args:
+        done: What is done.
+        total: What there is in all.
+    """
 
 
 Item = TypeVar("Item")

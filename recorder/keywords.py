@@ -89,7 +89,7 @@ class RecordingKeywords(TypedDict, total=False):
     per_kind: int | tuple[int, int] | None
     """How many of each kind: a number, or fewest and most."""
     sizes: tuple[float, float] | None
-    """The smallest and the largest extent of primitives and clutter, by longest side or diameter, all scales alike."""
+    """The smallest and the largest extent of primitives and clutter (longest side, diameter), all scales alike."""
     clutter: int | tuple[int, int] | None
     """How many things that are none of the kinds: a number, or fewest and most."""
     room: Sequence[str] | str | None

@@ -88,6 +88,10 @@ RECORDINGS = {
     "many primitives": Recording("do not fit on", QUICK + "--per-kind 40 --stops 2 2"),
     "a small floor": Recording("do not fit on", QUICK + "--per-kind 1 --stops 2 2 --arena 0.1 3"),
     "much clutter": Recording("do not fit on", QUICK + "--per-kind 0 --clutter 100 --stops 2 2"),
+    "sizes the other way": Recording(
+        "give the smaller one first:", QUICK + "--per-kind 0-1 --stops 2 2 --sizes 0.3 0.1"
+    ),
+    "large things on a small floor": Recording("do not fit on", QUICK + "--per-kind 1 --stops 2 2 --sizes 1 2"),
     "a small room": Recording("finds no place on", QUICK + "--per-kind 0 --room furniture --arena 0.1 0.1"),
     "a crowded room": Recording("do not fit on", QUICK + "--per-kind 4 --room L --arena 1 1"),
 }
@@ -246,6 +250,7 @@ NOT_IN_TABLES = {
     "a larger --resolution or a part of the log takes less": "how much memory there is",
     "(try: {} --help)": ABOVE,
     "m is too large to drive on: give": ABOVE,
+    "such as --sizes 0.05 2": "tests/replay/test_options.py",
     "change to another one": USERS,
     "choose another place": USERS,
     "give the output another name": USERS,

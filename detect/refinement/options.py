@@ -456,6 +456,8 @@ class AcceptanceOptions:
 
     min_log_ratio: float = 25.0
     """nats; log-likelihood ratio of the rays against nothing in its place."""
+    hopeless: float = -200.0
+    """nats; after the first fits, to some of the rays, candidates with less are given up."""
     max_misfit: float = 0.25
     """nats a ray; by which the map alone explains the rays that meet it better."""
     max_relative_std: float = 0.25

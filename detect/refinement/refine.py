@@ -91,6 +91,13 @@ class RefinedPrimitive:
         """Whether it is likelier none of the kinds than one of them."""
         return self.alternative is not None and self.alternative.replaces_kind and self.other_probability > 0.5
 
+    @property
+    def outline(self) -> FloatArray:
+        """Vertices (N, 2) in m of what it is likeliest."""
+        if self.is_other and self.alternative is not None:
+            return simple_outline(self.alternative.vertices)
+        return self.primitive.outline()
+
     def beside(self, alternatives: Sequence[Alternative], options: OtherOptions) -> RefinedPrimitive:
         """Hold the kinds against alternatives.
 
@@ -192,6 +199,8 @@ def refine_detections(
             reason = proposal_rejection_reason(result, guess.primitive, cells, options.acceptance)
         if result is None or reason:
             rejected.append(_rejection(guess, result, reason))
+        elif levels.is_room(result.outline):
+            rejected.append(_rejection(guess, result, "most of what lies within it is free: it is a part of a room"))
         elif result.is_other:
             objects.append(object_of(result, guess.since))
         else:
@@ -354,9 +363,8 @@ def object_of(result: RefinedPrimitive, since: int | None = None) -> UnknownObje
         The object, with the outline of the likeliest alternative.
     """
     assert result.alternative is not None
-    outline = simple_outline(result.alternative.vertices)
     std, reason = result.alternative.std, result.alternative.reason
-    return UnknownObject(outline, std, result.other_probability, reason, _share_of_kinds(result), since)
+    return UnknownObject(result.outline, std, result.other_probability, reason, _share_of_kinds(result), since)
 
 
 @dataclass
@@ -481,7 +489,7 @@ class Refinement:
         dropouts = estimate_dropouts(seen, noise, options.sensor)
         sensor = BeamModel.create(noise, span, max_std=max_noise, options=options.sensor, dropout_share=dropouts)
         fit_candidates(pool, seen, [True] * len(seen), sensor)
-        single = self._near_rays(without_duplicates(seen, preferred, sensor))
+        single = self._near_rays(self._without_hopeless(pool, seen, preferred, sensor))
         if not single:
             return {}
         noise = known_noise or estimate_noise(single, sensor)
@@ -498,6 +506,21 @@ class Refinement:
         finished = pool.map(lambda one, at: finish(one, at.background(one.bundle), sensor), single, alone)
         results = {id(candidate): result for candidate, result in zip(single, finished, strict=True)}
         return results if options.closed_world else self._beside_others(pool, single, results, sensor)
+
+    def _without_hopeless(
+        self, pool: Executor, seen: list[Candidate], preferred: list[Candidate], sensor: BeamModel
+    ) -> list[Candidate]:
+        """Remove duplicates, and what the rays speak against; what that hid is fitted again before it is judged."""
+        hopeless = self.options.acceptance.hopeless
+        single = without_duplicates(seen, preferred, sensor)
+        against = {id(one) for one in single if log_ratio_of(one, single, sensor) < hopeless}
+        sure = {id(one) for one in preferred}
+        if not against - sure:
+            return single
+        left = [one for one in single if id(one) not in against or id(one) in sure]
+        find_backgrounds(pool, left, is_first=True)
+        fit_candidates(pool, left, [id(one) in against for one in left], sensor)
+        return [one for one in left if id(one) not in against or log_ratio_of(one, left, sensor) > hopeless]
 
     def _find_sensor(
         self, pool: Executor, sites: Sequence[Site], candidates: list[Candidate], sensor: BeamModel
@@ -603,7 +626,7 @@ def _is_kept(result: RefinedPrimitive | None, limits: AcceptanceOptions) -> bool
 def without_duplicates(
     candidates: Sequence[Candidate], preferred: Sequence[Candidate], sensor: BeamModel
 ) -> list[Candidate]:
-    """Remove candidates that stand where one with a larger log-likelihood ratio does, or several rivals together have.
+    """Remove candidates in whose place one has a larger log-likelihood ratio, or several rivals together have one.
 
     Args:
         candidates: The fitted candidates.

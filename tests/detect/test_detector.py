@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -13,7 +15,7 @@ from detect.networks.tiles import TILE_SIZE
 from detect.networks.weights import KIND_NAMES, ModelCard, WeightsError
 from detect.networks.yolo import Boxes, Yolo, non_maximum_suppression
 from mapping.grid import GridFrame, OccupancyGrid
-from prim.errors import UsageError
+from prim.metrics import polygon_iou
 from prim.shapes import Kind
 from tests.detect.fakes import blobs, constant, weights
 
@@ -82,7 +84,7 @@ def test_rejected_candidates_suppress_nothing() -> None:
     made = detector()
     made.yolo = Yolo(weights(ModelCard("yolo", "det"), answer))
     made.thresholds |= {Kind.CIRCLE: 0.6, Kind.ELLIPSE: 0.3}
-    found = made.detect(grid_with((0.7, 1.3)))
+    found = made.detect(grid_with((0.7, 1.3)), (0.05, 0.3))
     assert [detection.primitive.kind for detection in found.found] == [Kind.ELLIPSE]
     assert [rejection.reason[:10] for rejection in found.rejected] == ["score 0.55"]
 
@@ -116,9 +118,46 @@ def test_no_network_runs_on_an_empty_map(value: float) -> None:
     assert found.found == () and found.rejected == () and session.batches == []  # type: ignore[attr-defined]
 
 
-def test_another_resolution_is_refused() -> None:
-    with pytest.raises(UsageError, match=r"cells of 0\.01 m, not 0\.02 m"):
-        detector().detect(OccupancyGrid(GridFrame(0.02, 0, 0, 9, 9), np.ones((9, 9), np.float32)))
+@pytest.mark.parametrize("resolution", [0.005, 0.02, 0.05])
+def test_networks_see_shapes_in_cells_of_any_size(resolution: float) -> None:
+    """The same cells, of another size: the same primitive, larger or smaller; in the units of the map."""
+    grid = grid_with((0.7, 1.3))
+    scale = resolution / 0.01
+    other = OccupancyGrid(replace(grid.frame, resolution=resolution), grid.probability)
+    (before,) = detector().detect(grid, (0.05, 0.3)).found
+    (after,) = detector().detect(other, (0.05 * scale, 0.3 * scale)).found
+    a, b = before.primitive, after.primitive
+    assert (b.x, b.y, *b.size) == pytest.approx([scale * value for value in (a.x, a.y, *a.size)])
+    assert after.box == pytest.approx([scale * value for value in before.box]) and after.score == before.score
+
+
+def test_large_things_are_detected_in_larger_cells() -> None:
+    """A blob of 1.6 m has 20 cells, the width that the fake network tells, in cells of 8 cm."""
+    (found,) = detector().detect(grid_with((4.0, 4.0), rows=900, cols=900, half=80)).found
+    assert found.primitive.x == pytest.approx(4.0 + 8 * 0.04, abs=0.05)
+    assert found.primitive.width_height[0] == pytest.approx(8 * 0.1)
+    (found,) = detector().detect(grid_with((4.0, 4.0), rows=900, cols=900)).found
+    assert found.primitive.width_height[0] == pytest.approx(0.1)
+
+
+def test_what_only_another_size_of_cells_shows_differently_is_a_rival() -> None:
+    """Two boxes at one place that differ in size: the better one is found, and refinement decides between them."""
+    grid = grid_with((1.0, 1.0), half=20)
+    found = detector().detect(grid, (0.05, 2.0))
+    assert len(found.found) == 1
+    for rival, rejection in found.rivals:
+        assert rejection in found.rejected
+        assert polygon_iou(rival.primitive, found.found[0].primitive) < 0.8
+
+
+def test_a_map_of_walls_is_looked_at_where_things_stand_isolated() -> None:
+    """A large room with one thing in it: few tiles of many."""
+    grid = grid_with((8.0, 5.0), rows=1200, cols=1600)
+    probability = grid.probability.copy()
+    probability[:5], probability[-5:], probability[:, :5], probability[:, -5:] = 4 * (CIRCLE_GREY,)
+    made, seen = detector(), []
+    made.detect(OccupancyGrid(grid.frame, probability), (0.05, 0.3), lambda done, total: seen.append((done, total)))
+    assert seen == [(1, 1)]
 
 
 def test_networks_that_contradict_their_model_card() -> None:

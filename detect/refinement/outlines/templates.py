@@ -196,7 +196,15 @@ class Template:
         return self.outline(*shares.tolist())
 
     def log_prior(self, q: FloatArray, prior: EvidenceOptions) -> float:
-        """Return the log prior density (nats; rad, m, shares) at parameters (K,) without that of the position."""
+        """Return the log prior density at some parameters, without that of the position.
+
+        Args:
+            q: (K,) x, y, theta, sizes (m), log odds of shares.
+            prior: The prior of sizes.
+
+        Returns:
+            Nats (rad, m, shares).
+        """
         sizes = prior.log_size_density - np.log(q[POSE : self.rigid])
         return math.log(self.names / (2 * math.pi)) + float(sizes.sum())
 

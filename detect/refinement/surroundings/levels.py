@@ -6,10 +6,13 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
 
+import numpy as np
+
 from detect.refinement.options import DEFAULTS, RefinementOptions
 from detect.refinement.surroundings.map_cells import MapCells
 from mapping.grid import OccupancyGrid
 from mapping.pyramid import PyramidLevel, coarser, levels_for
+from prim.arrays import FloatArray
 from prim.shapes import Primitive
 
 
@@ -65,8 +68,16 @@ class MapLevels:
     def __iter__(self) -> Iterator[MapLevel]:
         return iter(self.levels)
 
+    def is_room(self, outline: FloatArray) -> bool:
+        """Tell whether an outline (N, 2) in m, too large for the finest cells, is a room's: its inside is free."""
+        level = self._at_extent(2 * float(np.hypot(*(outline - outline.mean(axis=0)).T).max()))
+        return level is not self.levels[0] and level.cells.is_hollow(outline)
+
     def showing(self, primitive: Primitive) -> MapLevel:
         """Return the finest level at which the numbers hold for a thing of a primitive's extent."""
-        extent = 2 * primitive.bounding_radius
+        return self._at_extent(2 * primitive.bounding_radius)
+
+    def _at_extent(self, extent: float) -> MapLevel:
+        """Return the finest level at which the numbers hold for a thing of some extent (m)."""
         shown = (one for one in self.levels if extent <= self.options.map.shown_cells * one.level.resolution)
         return next(shown, self.levels[-1])

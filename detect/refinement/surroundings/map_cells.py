@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
+import shapely
 from numpy.typing import NDArray
 
 from detect.refinement.options import DEFAULTS, LineOptions, MapOptions
@@ -162,11 +163,12 @@ class MapCells:
         """
         return _cells_around(self.frame, primitive, reach)
 
-    def is_hollow(self, primitive: Primitive) -> bool:
-        """Tell whether most of what lies within a primitive is free: a room is, or a part of one."""
-        rows, cols, points = _cells_around(self.frame, primitive, primitive.bounding_radius)
-        inside = is_within(primitive, points, 0.0)
-        return bool(self.free[rows, cols][inside].mean() > self.options.max_hollow) if inside.any() else False
+    def is_hollow(self, outline: FloatArray) -> bool:
+        """Tell whether most of what lies within an outline (N, 2) in m is free: a room is, or a part of one."""
+        low, high = outline.min(axis=0), outline.max(axis=0)
+        rows, cols, points = _cells_within(self.frame, low, high)
+        inside = shapely.contains_xy(shapely.Polygon(outline), points[..., 0], points[..., 1])
+        return bool(inside.any() and self.free[rows, cols][inside].mean() > self.options.max_hollow)
 
     def is_behind_wall(self, primitive: Primitive) -> bool:
         """Tell whether a primitive reaches behind a wall that is free on one side only."""
@@ -221,14 +223,20 @@ class MapCells:
 
 def _cells_around(frame: GridFrame, primitive: Primitive, reach: float) -> tuple[slice, slice, FloatArray]:
     """Return the rows and columns of a grid around a primitive, and their cells' centres (rows, cols, 2)."""
+    centroid = np.array([primitive.x, primitive.y])
+    return _cells_within(frame, centroid - reach, centroid + reach)
 
-    def span(middle: float, first: int, count: int) -> tuple[int, int]:
-        low = math.floor((middle - reach) / frame.resolution) - first
-        high = math.ceil((middle + reach) / frame.resolution) - first
+
+def _cells_within(frame: GridFrame, lower: FloatArray, upper: FloatArray) -> tuple[slice, slice, FloatArray]:
+    """Return a grid's rows and columns between two corners (2,) in m, and their cells' centres (rows, cols, 2)."""
+
+    def span(axis: int, first: int, count: int) -> tuple[int, int]:
+        low = math.floor(lower[axis] / frame.resolution) - first
+        high = math.ceil(upper[axis] / frame.resolution) - first
         return min(max(low, 0), count), min(max(high, 0), count)
 
-    row, last_row = span(primitive.y, frame.row, frame.rows)
-    col, last_col = span(primitive.x, frame.col, frame.cols)
+    row, last_row = span(1, frame.row, frame.rows)
+    col, last_col = span(0, frame.col, frame.cols)
     x = (np.arange(col, last_col) + frame.col + 0.5) * frame.resolution
     y = (np.arange(row, last_row) + frame.row + 0.5) * frame.resolution
     return slice(row, last_row), slice(col, last_col), np.stack(np.meshgrid(x, y), axis=-1)

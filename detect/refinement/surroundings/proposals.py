@@ -36,8 +36,7 @@ def propose(levels: MapLevels, known: Sequence[Primitive], max_proposals: int | 
     for level in levels:
         proposed = _propose_at(level.cells, [*known, *made], max_proposals, level.options.proposals)
         shown = [around for around in proposed if levels.showing(around) is level]
-        is_finest = level is levels.levels[0]
-        made += [around for around in shown if is_finest or not level.cells.is_hollow(around)]
+        made += [around for around in shown if not levels.is_room(around.outline())]
     return made
 
 

@@ -202,8 +202,8 @@ def test_what_moves_is_refined_and_judged_with_the_options_of_the_replay(monkeyp
     watched(mixed_places, "judge_places")
     scans = [*scans_of(SQUARE), *later(scans_of(replace(SQUARE, x=SQUARE.x - 0.14)), 12)]
     grid, before = map_of(scans), fit_to(scans[:12], SQUARE)
-    look = Look(Detections((before,), ()), grid, MapLevels.of(grid), NOISE, scans[12:], scans)
     options = RefinementOptions(closed_world=True)
+    look = Look(Detections((before,), ()), grid, MapLevels.of(grid, options), NOISE, scans[12:], scans)
     moved = MovedPrimitives(map_of, lambda _: Detections((), ()), (0.0, 0.0), options)
     assert moved.correct(look, lambda: scans, Effort(max_proposals=0)).found
     assert {name for name, _ in given} == {"refine_detections", "judge_places"} and len(given) > 4

@@ -174,7 +174,7 @@ def test_modes_that_overlap_add_no_evidence() -> None:
 
 def test_a_fit_that_the_prior_allows_is_preferred_where_a_size_is_unseen() -> None:
     """The likelihood is the same however deep it is; a fit that wandered beyond the prior is no other mode."""
-    deep = KindFit(Kind.RECTANGLE, np.array([0.5, 0.5, 0.0, 0.2, 0.9]), 9.9, np.diag([1e6, 0.1, 1e4, 1e6, 0.1]))
+    deep = KindFit(Kind.RECTANGLE, np.array([0.5, 0.5, 0.0, 0.2, 1.2]), 9.9, np.diag([1e6, 0.1, 1e4, 1e6, 0.1]))
     shallow = replace(deep, p=np.array([0.5, 0.2, 0.0, 0.2, 0.3]), cost=10.0)
     assert distinct_modes([deep, shallow]) == [shallow]
     assert distinct_modes([replace(deep, cost=5.0), shallow])[0].cost == 5.0
