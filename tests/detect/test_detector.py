@@ -132,10 +132,10 @@ def test_networks_see_shapes_in_cells_of_any_size(resolution: float) -> None:
 
 
 def test_large_things_are_detected_in_larger_cells() -> None:
-    """A blob of 1.6 m has 20 cells, the width that the fake network tells, in cells of 8 cm."""
+    """A blob of 1.6 m has 40 cells in cells of 4 cm, where the fake network's 10 cells of radius are 0.4 m."""
     (found,) = detector().detect(grid_with((4.0, 4.0), rows=900, cols=900, half=80)).found
-    assert found.primitive.x == pytest.approx(4.0 + 8 * 0.04, abs=0.05)
-    assert found.primitive.width_height[0] == pytest.approx(8 * 0.1)
+    assert found.primitive.x == pytest.approx(4.0 + 4 * 0.04, abs=0.01)
+    assert found.primitive.width_height[0] == pytest.approx(4 * 0.1)
     (found,) = detector().detect(grid_with((4.0, 4.0), rows=900, cols=900)).found
     assert found.primitive.width_height[0] == pytest.approx(0.1)
 
