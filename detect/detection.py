@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -11,6 +11,19 @@ from numpy.typing import NDArray
 from prim.arrays import FloatArray
 from prim.shapes import Kind, Primitive
 from prim.world import Bounds
+
+Progress = Callable[[int, int], None]
+"""Called with what is done and what there is in all."""
+
+
+def no_progress(done: int, total: int) -> None:
+    """Report nothing.
+
+    Args:
+        done: What is done.
+        total: What there is in all.
+    """
+
 
 OTHER = "other"
 """What the hypothesis «none of the kinds» is called beside the kinds' names."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import islice
 from pathlib import Path
@@ -13,7 +13,7 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from detect.detection import Detection, Detections, Rejection
+from detect.detection import Detection, Detections, Progress, Rejection, no_progress
 from detect.networks.cnn import ClassifiedRegion, ParameterEstimator
 from detect.networks.tiles import TILE_MARGIN, TILE_SIZE, tile_around, tile_frames, tile_image
 from detect.networks.weights import BATCHES, Weights, load_weight_set
@@ -110,19 +110,6 @@ class _SeenMap:
 
 
 NOTHING = Detections((), ())
-
-Progress = Callable[[int, int], None]
-"""Called with what is done and what there is in all."""
-
-
-def no_progress(done: int, total: int) -> None:
-    """Report nothing.
-
-    Args:
-        done: What is done.
-        total: What there is in all.
-    """
-
 
 Item = TypeVar("Item")
 Scored = TypeVar("Scored", Detection, Rejection)

@@ -399,7 +399,13 @@ def _pipeline(
     recording = None if save is None else checked_path("save", save)
     if recording:
         check_no_input([path, *([chosen.weights] if chosen.weights else [])], [recording])
-    return Pipeline(path, chosen, _viewer(recording, force), progress)
+
+    def after_scan(stage: str, done: int, total: int) -> None:
+        """Tell the caller of the scans alone."""
+        if progress is not None and stage == "scans":
+            progress(done, total)
+
+    return Pipeline(path, chosen, _viewer(recording, force), after_scan)
 
 
 def _viewer(save: Path | None, force: bool) -> Viewer | None:

@@ -14,7 +14,7 @@ from replay.mapping.stage import MappingStage, Usage, make_replay_mapper
 from replay.options import ReplayOptions
 from replay.replay_evaluator import ReplayEvaluator
 from replay.scans.posed_scans import PosedScans
-from replay.timing import StageTimer
+from replay.timing import StageProgress, StageTimer, no_stage_progress
 from replay.viewing.protocol import Viewer
 
 
@@ -43,6 +43,7 @@ class Branch:
         viewer: Shows the map and the detections.
         shared: The timer of the replay.
         interrupts: Lets interruptions come while primitives are detected.
+        progress: Called with a stage, what of it is done, and what there is in all.
 
     Attributes:
         options: Options of the replay, with this mapper alone.
@@ -59,6 +60,7 @@ class Branch:
         viewer: Viewer,
         shared: StageTimer,
         interrupts: Interrupts,
+        progress: StageProgress = no_stage_progress,
     ) -> None:
         self.options = options
         self.mapper = options.mapper
@@ -70,7 +72,7 @@ class Branch:
         self._timer = timer = StageTimer(shared)
         self.seconds = timer.seconds
         self._detection = make_detection_stage(
-            options, frame, posed_scans, evaluator.comparable_truth, viewer.shows, timer
+            options, frame, posed_scans, evaluator.comparable_truth, viewer.shows, timer, progress
         )
         scans, cells = len(posed_scans.scan_log), frame.rows * frame.cols
         snapshots = snapshot_interval(options, scans, cells) if viewer.shows else NEVER
@@ -139,4 +141,4 @@ class Branch:
 
     def notes(self, grid: OccupancyGrid) -> list[str]:
         """Return what a user should know of the final map ``grid``, and of how often it was shown and searched."""
-        return [*self._notes, *self._mapping.notes(grid)]
+        return [*self._notes, *self._detection.notes(), *self._mapping.notes(grid)]

@@ -495,7 +495,7 @@ def _replay_log(log: Path, outputs: OutputFiles, run: Run) -> int:
 
     replaced = outputs.check(run.options.mappers)
     viewer = _make_viewer(run.viewer, outputs.recording)
-    with console.progress_bar("scans", run.verbosity.quiet) as progress:
+    with console.stage_bars(run.verbosity.quiet) as progress:
         results = Pipeline(log, run.options, viewer, progress, run.interrupts).run_each()
     interruption = results[0].interrupted
     if interruption is not None and replaced and not outputs.force:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -25,14 +25,12 @@ from replay.replay_evaluator import ReplayEvaluator
 from replay.result import ReplayResult, distinct_notes
 from replay.scans.posed_scans import PosedScans
 from replay.scans.scan_log import ScanLog
-from replay.timing import RatePacer, StageTimer
+from replay.timing import RatePacer, StageProgress, StageTimer, no_stage_progress
 from replay.viewing.protocol import NullViewer, Scene, Viewer
 
 if TYPE_CHECKING:
     from detect.detection import SensorErrors
     from replay.detection.stage import DetectionResult
-
-Progress = Callable[[int, int], None]
 
 
 class Pipeline:
@@ -42,7 +40,7 @@ class Pipeline:
         path: The log: a file, or a folder of a ROS 2 bag.
         options: How it is replayed.
         viewer: Shows the replay as it goes; None for no viewer.
-        progress: Called after each scan with the number of scans so far and in all.
+        progress: Called with a stage («scans», «detect», «refine»), what of it is done, and what there is in all.
         interrupts: Holds interruptions back where something would be torn. While they are active, a replay that is
             interrupted ends with the results of the scans until then; else KeyboardInterrupt is raised.
     """
@@ -52,13 +50,13 @@ class Pipeline:
         path: Path,
         options: ReplayOptions,
         viewer: Viewer | None = None,
-        progress: Progress | None = None,
+        progress: StageProgress = no_stage_progress,
         interrupts: Interrupts | None = None,
     ) -> None:
         self.path = path
         self.options = options
         self.viewer: Viewer = viewer or NullViewer()
-        self._progress = progress or (lambda done, total: None)
+        self._progress = progress
         self._interrupts = interrupts or Interrupts()
         self._interrupted: KeyboardInterrupt | None = None
         self._timer = StageTimer()
@@ -137,7 +135,7 @@ class Pipeline:
     def _branches(self, frame: GridFrame, posed_scans: PosedScans, evaluator: ReplayEvaluator) -> list[Branch]:
         """Make a branch for each mapper: it maps, detects primitives, and shows both."""
         return [
-            Branch(options, frame, posed_scans, evaluator, self.viewer, self._timer, self._interrupts)
+            Branch(options, frame, posed_scans, evaluator, self.viewer, self._timer, self._interrupts, self._progress)
             for options in self.options.by_mapper()
         ]
 
@@ -179,7 +177,7 @@ class Pipeline:
         for posed in posed_scans:
             pacer.wait(posed.scan.stamp)
             yield posed
-            self._progress(posed.position + 1, len(posed_scans.scan_log))
+            self._progress("scans", posed.position + 1, len(posed_scans.scan_log))
 
     def _begin_viewer(
         self, frame: GridFrame, posed_scans: PosedScans, branches: Sequence[Branch], evaluator: ReplayEvaluator

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from typing import TypeVar
 
@@ -13,7 +13,20 @@ STAGES = ("read", "localize", "map", "detect", "refine", "viewer")
 MAX_WAIT = 10.0
 """A paced replay waits no longer (s) for one scan, however long the log pauses; set by hand."""
 
+StageProgress = Callable[[str, int, int], None]
+"""Called with a stage, what of it is done, and what there is in all."""
+
 Item = TypeVar("Item")
+
+
+def no_stage_progress(stage: str, done: int, total: int) -> None:
+    """Report nothing.
+
+    Args:
+        stage: The stage.
+        done: What of it is done.
+        total: What there is in all.
+    """
 
 
 class StageTimer:

@@ -21,7 +21,15 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from detect.detection import Detection, Detections, Rejection, SensorErrors, UnknownObject
+from detect.detection import (
+    Detection,
+    Detections,
+    Progress,
+    Rejection,
+    SensorErrors,
+    UnknownObject,
+    no_progress,
+)
 from detect.refinement.candidates import Candidate, by_level, find_backgrounds, fit_candidates
 from detect.refinement.fitting.evidence import compare_kinds
 from detect.refinement.likelihood.geometry import parameters_of, ranges_to
@@ -155,6 +163,7 @@ def refine_detections(
     effort: Effort = THOROUGH,
     options: RefinementOptions = DEFAULTS,
     levels: MapLevels | None = None,
+    progress: Progress = no_progress,
 ) -> tuple[Detections, float | None]:
     """Refine a map's detections, and find what the networks missed.
 
@@ -167,6 +176,7 @@ def refine_detections(
         effort: How thoroughly.
         options: Numeric parameters.
         levels: The map at several sizes of its cells, where that is made already, with the same options.
+        progress: Called with how many candidates are refined, and how many there are.
 
     Returns:
         What the rays support, likeliest kinds first, and what they do not, with the reasons; and the noise (m), None
@@ -184,6 +194,7 @@ def refine_detections(
         threads,
         guessed_noise=warm_start.noise_std if warm_start else None,
         rounds=effort.rounds,
+        progress=progress,
     )
     refined = refinement.run(starts, scans, known, found, [detection.since for detection in wanted])
     kept: list[Detection] = []
@@ -367,6 +378,22 @@ def object_of(result: RefinedPrimitive, since: int | None = None) -> UnknownObje
     return UnknownObject(result.outline, std, result.other_probability, reason, _share_of_kinds(result), since)
 
 
+SEARCHED, ESTIMATED, COMPARED = 0.3, 0.7, 0.85
+"""Shares of the work that are done once candidates are fitted, the sensor is known, and kinds are compared, about."""
+
+
+@dataclass
+class _Done:
+    """How many of some candidates are done, by the share of the work."""
+
+    progress: Progress
+    total: int
+
+    def reach(self, share: float) -> None:
+        """Tell that a share of the work is done."""
+        self.progress(math.floor(share * self.total), self.total)
+
+
 @dataclass
 class Refinement:
     """Fits primitives to the rays of the scans that a map was made of.
@@ -377,6 +404,7 @@ class Refinement:
         threads: How many are used.
         guessed_noise: A first guess (m) of the noise, where there is one.
         rounds: Joint fits once duplicates are gone; None: as in the options.
+        progress: Called with how many candidates are refined, and how many there are.
         sensor: Errors of the scanner that :meth:`run` found and corrected; None where it found none.
         further: Of things that were separated by :meth:`run`, those beyond the guesses: with the index of the guess
             that they were a part of.
@@ -387,6 +415,7 @@ class Refinement:
     threads: int = 2
     guessed_noise: float | None = None
     rounds: int | None = None
+    progress: Progress = no_progress
     sensor: SensorErrors | None = None
     further: list[tuple[int, RefinedPrimitive]] = field(default_factory=list)
     _separated: list[Trial] = field(default_factory=list)
@@ -492,11 +521,14 @@ class Refinement:
         single = self._near_rays(self._without_hopeless(pool, seen, preferred, sensor))
         if not single:
             return {}
+        done = _Done(self.progress, len(single))
+        done.reach(SEARCHED)
         noise = known_noise or estimate_noise(single, sensor)
         dropouts = estimate_dropouts(single, noise, options.sensor)
         sensor = BeamModel.create(noise, span, max_std=max_noise, options=options.sensor, dropout_share=dropouts)
         self._fit_jointly(pool, single, sensor)
         single, sensor = self._find_sensor(pool, sites, single, sensor)
+        done.reach(ESTIMATED)
         disperses = sensor.dispersion > options.sensor.significant_dispersion
         fit_candidates(pool, single, [disperses] * len(single), sensor)
         self.noise_std = sensor.std
@@ -504,8 +536,14 @@ class Refinement:
         maps = {id(cells): DistanceMap.of(cells.occupied, cells.frame) for cells in levels}
         alone = [maps[id(candidate.cells)] for candidate in single]
         finished = pool.map(lambda one, at: finish(one, at.background(one.bundle), sensor), single, alone)
-        results = {id(candidate): result for candidate, result in zip(single, finished, strict=True)}
-        return results if options.closed_world else self._beside_others(pool, single, results, sensor)
+        results = {}
+        for number, (candidate, result) in enumerate(zip(single, finished, strict=True), start=1):
+            results[id(candidate)] = result
+            done.reach(ESTIMATED + (COMPARED - ESTIMATED) * number / len(single))
+        if not options.closed_world:
+            results = self._beside_others(pool, single, results, sensor)
+        done.reach(1.0)
+        return results
 
     def _without_hopeless(
         self, pool: Executor, seen: list[Candidate], preferred: list[Candidate], sensor: BeamModel

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from detect.detection import Progress, no_progress
 from detect.refinement.options import DEFAULTS, RefinementOptions
 from mapping.grid import OccupancyGrid
 from prim.arrays import FloatArray
@@ -203,6 +204,7 @@ class DetectionRefiner:
         detections: Detections,
         grid: OccupancyGrid,
         scans: Callable[[], Iterable[tuple[Scan, Pose2D]]],
+        progress: Progress = no_progress,
     ) -> tuple[Detections, float | None]:
         """Refine detections with the rays of all scans.
 
@@ -210,6 +212,7 @@ class DetectionRefiner:
             detections: What the networks found.
             grid: The map that they found it in.
             scans: Returns the pieces of all scans, with the laser's poses, each time anew.
+            progress: Called with how many candidates are refined, and how many there are.
 
         Returns:
             The refined detections and the range noise (m), None where no ray passes any of them.
@@ -218,7 +221,7 @@ class DetectionRefiner:
         from detect.refinement.surroundings.levels import MapLevels
 
         levels = MapLevels.of(grid, self._refinement)
-        refined, noise_std = self._refine(detections, grid, levels, scans(), THOROUGH)
+        refined, noise_std = self._refine(detections, grid, levels, scans(), THOROUGH, progress)
         refined = self._correct(refined, grid, levels, noise_std, scans, THOROUGH)
         return self._with_frame_uncertainty(refined), noise_std
 
@@ -248,12 +251,13 @@ class DetectionRefiner:
         levels: MapLevels,
         scans: Iterable[tuple[Scan, Pose2D]],
         effort: Effort,
+        progress: Progress = no_progress,
     ) -> tuple[Detections, float | None]:
         # imported when it is needed: a replay without refinement starts faster
         from detect.refinement.refine import refine_detections
 
         return refine_detections(
-            detections, scans, grid, self._noise_std, cores(), effort, self._refinement, levels=levels
+            detections, scans, grid, self._noise_std, cores(), effort, self._refinement, levels, progress
         )
 
     def _with_frame_uncertainty(self, detections: Detections) -> Detections:

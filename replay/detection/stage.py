@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -20,11 +21,12 @@ from prim.se2 import Pose2D
 from prim.shapes import Primitive
 from prim.threads import preload
 from replay.detection.refiner import DetectionRefiner
+from replay.detection.visibility import Visibility
 from replay.ground_truth import GroundTruth
 from replay.intervals import detection_interval, is_due
 from replay.options import ReplayOptions
 from replay.scans.posed_scans import PosedScans
-from replay.timing import StageTimer
+from replay.timing import StageProgress, StageTimer, no_stage_progress
 
 if TYPE_CHECKING:
     from detect.detection import Detections
@@ -86,6 +88,7 @@ class DetectionStage:
         is_shown: Whether the replay is shown, so that primitives are detected along the way unless the options say
             otherwise.
         timer: Counts the time towards the stages «detect» and «refine».
+        progress: Called with a stage, what of it is done, and what there is in all.
 
     Attributes:
         skipped: None: detection is possible.
@@ -103,10 +106,13 @@ class DetectionStage:
         truth: GroundTruth | None,
         is_shown: bool,
         timer: StageTimer,
+        progress: StageProgress = no_stage_progress,
     ) -> None:
         self._detector = detector
+        self._progress = progress
         self._posed_scans = posed_scans
         self._sizes = options.sizes
+        self._visibility = Visibility(_resolution(options, frame))
         self._own_mapper = _own_mapper(options, frame)
         cells = math.prod(GridFrame.covering(frame.bounds, _resolution(options, frame)).shape)
         interval = detection_interval(options, len(posed_scans.scan_log), cells, is_shown)
@@ -167,16 +173,24 @@ class DetectionStage:
         with self._timer.stage("detect"):
             if self._own_mapper is not None:
                 grid = self._own_mapper.finish()
-            detections = self._detector.detect(grid, self._sizes)
+            detections = self._detector.detect(grid, self._sizes, partial(self._progress, "detect"))
         noise_std = None
         if self._refiner:
             with self._timer.stage("refine"):
-                detections, noise_std = self._refiner.refine(detections, grid, lambda: _pieces(self._posed_scans))
+                refining = partial(self._progress, "refine")
+                scans = partial(_pieces, self._posed_scans)
+                detections, noise_std = self._refiner.refine(detections, grid, scans, refining)
         return self._result(detections, int(self._posed_scans.scan_log.stamps[-1]), noise_std)
+
+    def notes(self) -> list[str]:
+        """Return what a user should know of the scans so far: which of the wanted objects they cannot show."""
+        note = self._visibility.note(self._sizes)
+        return [note] if note else []
 
     def _add(self, posed: PosedScan) -> None:
         """Add a scan to the detector's own map, and to those that refine detections before the last scan."""
         for scan, pose in posed.pieces:
+            self._visibility.add(scan)
             if self._refiner and self.streaming:
                 self._refiner.add(scan, pose)
             if self._own_mapper is not None:
@@ -221,6 +235,10 @@ class NoDetection:
     streaming = False
     note = ""
 
+    def notes(self) -> list[str]:
+        """See :meth:`DetectionStage.notes`."""
+        return []
+
     def __init__(self, skipped: str | None = None) -> None:
         self.skipped = skipped
 
@@ -238,6 +256,7 @@ def make_detection_stage(
     truth: GroundTruth | None,
     is_shown: bool,
     timer: StageTimer,
+    progress: StageProgress = no_stage_progress,
 ) -> DetectionStage | NoDetection:
     """Make the stage that detects, with the weights that are named or those that come with prim.
 
@@ -248,6 +267,7 @@ def make_detection_stage(
         truth: The true world, in coordinates of the map; None where it is not known.
         is_shown: Whether the replay is shown.
         timer: Counts the time of loading towards the stage «detect».
+        progress: Called with a stage, what of it is done, and what there is in all.
 
     Returns:
         The stage; a :class:`NoDetection` where detection is not wanted, or where it was not explicitly asked for and
@@ -268,7 +288,7 @@ def make_detection_stage(
                 f"no weights for maps of {options.mapper} come with prim: give --weights, or --no-detect"
             )
         detector = _load(weights, options.mapper, timer)
-        return DetectionStage(detector, options, frame, posed_scans, truth, is_shown, timer)
+        return DetectionStage(detector, options, frame, posed_scans, truth, is_shown, timer, progress)
     except (UsageError, WeightsError) as error:
         if explicit:
             raise

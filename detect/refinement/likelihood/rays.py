@@ -80,7 +80,7 @@ class RayBundle:
         differ = np.abs(self.rays[BACKGROUND] - other.rays[BACKGROUND]) > limits.similar_nats
         occlusions = np.minimum(self.rays[OCCLUSION], FAR) - np.minimum(other.rays[OCCLUSION], FAR)
         differ |= np.abs(occlusions) > limits.similar_range
-        return np.count_nonzero(differ) <= limits.similar_share * len(differ)
+        return int(np.count_nonzero(differ)) <= limits.similar_share * len(differ)
 
     def with_rays(self, rays: FloatArray) -> RayBundle:
         """Return the bundle with other numbers (7, N)."""
