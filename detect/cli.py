@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 import sys
 from collections.abc import Sequence
 from enum import StrEnum
@@ -41,6 +42,7 @@ class DatasetPreset(StrEnum):
     PAPER = "paper"
     MIXED = "mixed"
     LARGE = "large"
+    OPEN = "open"
 
 
 class CnnPreset(StrEnum):
@@ -95,6 +97,33 @@ def dataset(
     kind: Annotated[
         list[str] | None, typer.Option(metavar="KIND", help="A kind of primitive; may be repeated. [default: all]")
     ] = None,
+    sizes: Annotated[
+        tuple[float, float] | None,
+        typer.Option(metavar="MIN MAX", help="Extents of primitives and clutter, metres, all scales alike."),
+    ] = None,
+    resolution: Annotated[
+        list[float] | None, typer.Option(metavar="M", help="Side of a map's cells, metres; may be repeated.")
+    ] = None,
+    arena: Annotated[
+        list[float] | None, typer.Option(metavar="M", help="Side of the square floor, metres; may be repeated.")
+    ] = None,
+    rays: Annotated[list[int] | None, typer.Option(metavar="N", help="Beams in a scan; may be repeated.")] = None,
+    fov: Annotated[list[float] | None, typer.Option(metavar="DEG", help="Field of view; may be repeated.")] = None,
+    range_max: Annotated[
+        list[float] | None, typer.Option(metavar="M", help="Longest range, metres; may be repeated.")
+    ] = None,
+    clutter: Annotated[
+        tuple[int, int] | None, typer.Option(metavar="FEWEST MOST", help="Things that are none of the kinds.")
+    ] = None,
+    room: Annotated[
+        list[str] | None, typer.Option(metavar="NAME,...", help="As --room of prim-record; may be repeated.")
+    ] = None,
+    faulty: Annotated[
+        float | None, typer.Option(metavar="SHARE", help="Share of the sessions whose scanner has faults.")
+    ] = None,
+    world: Annotated[
+        list[Path] | None, typer.Option(metavar="WORLD.json", help="A world of your own; may be repeated.")
+    ] = None,
     seed: Annotated[int | None, typer.Option(metavar="N", help="The first session's seed.")] = None,
     workers: Annotated[
         int | None, typer.Option(metavar="N", help="Worker processes. [default: one per core]", min=1)
@@ -115,6 +144,16 @@ def dataset(
         "mappers": tuple(name.value for name in mapper) if mapper else None,
         "kinds": tuple(chosen.value for chosen in parse_kinds(kind)) if kind else None,
         "seed": seed,
+        "extents": sizes,
+        "cells": tuple(resolution) if resolution else None,
+        "floors": tuple(arena) if arena else None,
+        "rays": tuple(rays) if rays else None,
+        "fovs": tuple(math.radians(angle) for angle in fov) if fov else None,
+        "range_maxes": tuple(range_max) if range_max else None,
+        "clutter": clutter,
+        "rooms": tuple(room) if room else None,
+        "faulty": faulty,
+        "worlds": tuple(str(path) for path in world) if world else None,
     }
     options = dataclasses.replace(
         DATASET_PRESETS[preset.value], **{name: value for name, value in given.items() if value is not None}

@@ -426,11 +426,12 @@ def _scaled(found: Detections, scale: float) -> Detections:
         return found
 
     def larger(detection: Detection) -> Detection:
-        primitive = detection.primitive
-        size = tuple(scale * value for value in primitive.size)
-        made = replace(primitive, x=scale * primitive.x, y=scale * primitive.y, size=size)
         x0, y0, x1, y1 = detection.box
-        return replace(detection, primitive=made, box=(scale * x0, scale * y0, scale * x1, scale * y1))
+        return replace(
+            detection,
+            primitive=detection.primitive.scaled(scale),
+            box=(scale * x0, scale * y0, scale * x1, scale * y1),
+        )
 
     moved = {id(one): replace(one, x=scale * one.x, y=scale * one.y) for one in found.rejected}
     return Detections(

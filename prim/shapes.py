@@ -354,6 +354,10 @@ class Primitive:
         theta = theta % period
         return replace(self, theta=0.0 if theta >= period else theta, size=size)
 
+    def scaled(self, factor: float) -> Primitive:
+        """Return it in other units: place and sizes so many times as large, kind and angle the same."""
+        return replace(self, x=factor * self.x, y=factor * self.y, size=tuple(factor * value for value in self.size))
+
     def local_outline(self, points: int = OUTLINE_POINTS) -> FloatArray:
         """Return the outline's vertices (N, 2) in the shape's frame (m), counter-clockwise; round ones ``points``."""
         if self.is_round:

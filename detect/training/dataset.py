@@ -15,6 +15,7 @@ interrupted run can be continued. In ``detect`` only training and evaluation use
 
 from __future__ import annotations
 
+import math
 import re
 import shlex
 import tempfile
@@ -33,7 +34,7 @@ from detect.networks.tiles import TILE_SIZE, Box, tile_frames, tile_image
 from detect.networks.weights import KIND_NAMES
 from detect.networks.yolo import KINDS
 from mapping.grid import GridFrame, OccupancyGrid
-from mapping.mapper import MAPPERS, make_mapper
+from mapping.mapper import MAPPERS, check_cells, make_mapper
 from prim import strict_json
 from prim.errors import OutputError, UsageError
 from prim.files import ResultFormat, output_errors, write_file
@@ -45,7 +46,8 @@ from prim.scan import Scan
 from prim.se2 import Pose2D, Trajectory
 from prim.shapes import Kind, Primitive
 from prim.world import Bounds, World
-from recorder.keywords import LARGEST
+from recorder.faults import NO_FAULTS, ScannerFaults
+from recorder.keywords import BOX_ROOM, LARGEST
 from recorder.sensors import Lidar
 from recorder.session import SessionOptions, record_session
 from recorder.world import WorldOptions
@@ -80,7 +82,19 @@ class DatasetOptions:
         floors: Sides (m) of the square floor; each session draws one.
         motions: ``warp`` or ``drive``; each session draws one.
         walled: Share of the sessions with walls.
-        resolution: Side of a cell (m).
+        resolution: Side of a cell (m) as the networks know it.
+        cells: Sides of the cells (m) that sessions are mapped with; each draws one, and is written as if it had those
+            of ``resolution``: networks see shapes in cells. Empty: ``resolution``.
+        scales: Floor, primitives, clutter, cells and the scanner's reach are so many times as large; each session
+            draws one.
+        extents: The smallest and the largest extent of primitives and clutter (m) at a scale of 1; None: the paper's.
+        fovs: Fields of view (rad); each session draws one.
+        range_maxes: The scanner's longest ranges (m) at a scale of 1; each session draws one.
+        clutter: Fewest and most things that are none of the kinds.
+        rooms: What rooms are or have, names of recorder.rooms separated by commas, or «box»; each walled session
+            draws one.
+        faulty: Share of the sessions whose scanner has faults.
+        worlds: Files of worlds in place of drawn ones; each session draws one.
         rounded: Mappers whose images are in the style ``rounded`` (networks.tiles.STYLES).
 
     Raises:
@@ -99,9 +113,19 @@ class DatasetOptions:
     walled: float = 1.0
     resolution: float = 0.01
     rounded: tuple[str, ...] = ()
+    cells: tuple[float, ...] = ()
+    scales: tuple[float, ...] = (1.0,)
+    extents: tuple[float, float] | None = None
+    fovs: tuple[float, ...] = (Lidar.fov,)
+    range_maxes: tuple[float, ...] = (Lidar.range_max,)
+    clutter: tuple[int, int] = (0, 0)
+    rooms: tuple[str, ...] = (BOX_ROOM,)
+    faulty: float = 0.0
+    worlds: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
-        for name in ("noise_stds", "mappers", "kinds", "rays", "stops", "floors", "motions"):
+        lists = ("noise_stds", "mappers", "kinds", "rays", "stops", "floors", "motions", "scales", "fovs", "rooms")
+        for name in (*lists, "range_maxes"):
             if not getattr(self, name):
                 raise UsageError(f"a set needs at least one of {name}")
         unknown = [mapper for mapper in self.mappers if mapper not in MAPPERS]
@@ -114,8 +138,11 @@ class DatasetOptions:
         if not all(0 <= std <= LARGEST["noise_std"] for std in self.noise_stds):
             stds = ", ".join(f"{std:g}" for std in self.noise_stds)
             raise UsageError(f"--noise-std is {stds}: it must be from 0 to {LARGEST['noise_std']:g} m")
-        if not 0 <= self.walled <= 1:
-            raise UsageError(f"walled is {self.walled:g}: it is a share, from 0 to 1")
+        for share in ("walled", "faulty"):
+            if not 0 <= getattr(self, share) <= 1:
+                raise UsageError(f"{share} is {getattr(self, share):g}: it is a share, from 0 to 1")
+        for cell in self.cells:
+            check_cells(cell, None)
 
 
 DATASET_PRESETS = {
@@ -132,8 +159,33 @@ DATASET_PRESETS = {
     ),
 }
 DATASET_PRESETS["large"] = replace(DATASET_PRESETS["mixed"], sizes=(2400, 60), seed=210_000)
+DATASET_PRESETS["open"] = replace(
+    DATASET_PRESETS["mixed"],
+    sizes=(2400, 120),
+    seed=220_000,
+    noise_stds=(0.0, 0.01, 0.02, 0.03, 0.05, 0.075, 0.1, 0.25, 0.375, 0.5),
+    rays=(180, 360, 500, 1000),
+    floors=(2.0, 3.0, 3.0),
+    scales=(1.0, 1.0, 2.0, 5.0),
+    extents=(0.05, 0.5),
+    fovs=(Lidar.fov, Lidar.fov, 1.5 * math.pi, math.pi),
+    clutter=(0, 4),
+    rooms=("box", "box", "doorways", "pilasters", "furniture", "round", "corridor", "L"),
+    faulty=0.3,
+)
 """The paper's data sets (III-B, IV-B: 500 and 125 maps, one noise level each, rounded); the one that the shipped
-networks were first trained on; and the larger one that their training was continued on."""
+networks were first trained on; the larger one that their training was continued on; and one of real places: clutter,
+rooms, faulty scanners, things of any size in cells that go with them."""
+
+FAULTS = (
+    ScannerFaults(range_bias=0.02),
+    ScannerFaults(beam_width=math.radians(0.5)),
+    ScannerFaults(beam_width=math.radians(1.0), quantum=0.01),
+    ScannerFaults(dropouts=0.1, dropout_as="nan"),
+    ScannerFaults(dropouts=0.1, outliers=0.01),
+    ScannerFaults(noise_growth=0.01, quantum=0.001),
+)
+"""Of which a session with a faulty scanner draws one."""
 
 
 def session_seeds(options: DatasetOptions) -> Iterator[tuple[str, int]]:
@@ -154,21 +206,53 @@ def session_options(options: DatasetOptions, seed: int) -> SessionOptions:
     Returns:
         The session's options.
     """
-    rng = np.random.default_rng((seed, 1))
+    rng, more = np.random.default_rng((seed, 1)), np.random.default_rng((seed, 2))
     floor = float(rng.choice(options.floors))
-    max_per_kind = max(2, round(2 * (floor / 2) ** 2))
+    most = 2 if options.extents is None else 1  # of larger things fewer find places
+    max_per_kind = max(most, round(most * (floor / 2) ** 2))
     stops = max(2, round(int(rng.choice(options.stops)) * floor / 2))
+    scale = session_scale(options, seed)
+    walled = bool(rng.random() < options.walled)
+    room = str(more.choice(options.rooms))
     world = WorldOptions(
-        size=(floor, floor),
+        size=(scale * floor, scale * floor),
         kinds=tuple(Kind(kind) for kind in options.kinds),
         per_kind=(0, max_per_kind),
-        walls=bool(rng.random() < options.walled),
+        walls=walled,
+        clutter=options.clutter,
+        room=tuple(room.split(",")) if walled and room != BOX_ROOM else (),
+        sizes=None if options.extents is None else (scale * options.extents[0], scale * options.extents[1]),
     )
-    lidar = Lidar(rays=int(rng.choice(options.rays)), noise_std=float(rng.choice(options.noise_stds)))
+    faults = FAULTS[more.integers(len(FAULTS))] if more.random() < options.faulty else NO_FAULTS
+    lidar = Lidar(
+        rays=int(rng.choice(options.rays)),
+        noise_std=float(rng.choice(options.noise_stds)),
+        fov=float(more.choice(options.fovs)),
+        range_max=scale * float(more.choice(options.range_maxes)),
+        faults=faults,
+    )
     motion = str(rng.choice(options.motions))
     return SessionOptions(
-        seed=seed, world=world, motion=motion, stops=(stops, stops), duration=20.0 * floor, rate=5.0, lidar=lidar
+        seed=seed,
+        world=world,
+        world_file=Path(str(more.choice(options.worlds))) if options.worlds else None,
+        motion=motion,
+        stops=(stops, stops),
+        duration=20.0 * floor,
+        rate=5.0,
+        lidar=lidar,
     )
+
+
+def session_scale(options: DatasetOptions, seed: int) -> float:
+    """Draw how many times as large as at a scale of 1 a session is."""
+    return float(np.random.default_rng((seed, 3)).choice(options.scales))
+
+
+def session_cell(options: DatasetOptions, seed: int) -> float:
+    """Draw the side (m) of the cells that a session is mapped with."""
+    cells = options.cells or (options.resolution,)
+    return session_scale(options, seed) * float(np.random.default_rng((seed, 4)).choice(cells))
 
 
 def make_dataset(
@@ -271,15 +355,21 @@ def output_failure(write: Callable[[], None]) -> tuple[str, OSError] | None:
 
 
 def _write_session(folder: Path, options: DatasetOptions, split: str, seed: int) -> None:
-    """Record and map one session, and write its tiles."""
-    session = session_options(options, seed)
-    world, scans = simulate_session(session)
-    frame = map_frame(world, options.resolution)
+    """Record and map one session, and write its tiles, with cells as the networks know them."""
+    session, cell = session_options(options, seed), session_cell(options, seed)
+    try:
+        world, scans = simulate_session(session)
+    except UsageError:  # such a room, or so much clutter, finds no place among the primitives
+        world, scans = simulate_session(replace(session, world=replace(session.world, room=(), clutter=(0, 0))))
+    frame = map_frame(world, cell)
+    known = replace(frame, resolution=options.resolution)
     grids = {
-        mapper: map_scans(mapper, scans, options.resolution, frame.bounds, threads=1) for mapper in options.mappers
+        mapper: replace(map_scans(mapper, scans, cell, frame.bounds, threads=1), frame=known)
+        for mapper in options.mappers
     }
-    for number, tile in enumerate(tile_frames(frame)):
-        primitives = primitives_in_tile(world.primitives, tile)
+    seen = [primitive.scaled(options.resolution / cell) for primitive in world.primitives]
+    for number, tile in enumerate(tile_frames(known)):
+        primitives = primitives_in_tile(seen, tile)
         name = f"{seed:06d}_{number}"
         for mapper, grid in grids.items():
             style = "rounded" if mapper in options.rounded else "grey"

@@ -1,15 +1,19 @@
+import math
+
 import numpy as np
 import pytest
 import shapely
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from prim.shapes import Kind
 from prim.world import World
 from recorder.keywords import recording_options
 from recorder.motion import drive, warp
 from recorder.placement import PlacementOptions
 from recorder.rooms import DEFAULTS, ELEMENTS, SHAPES
 from recorder.simulator import Simulator
+from recorder.world import draw_primitive
 from tests.recorder.drawn import drawn, outlines, solids, walls
 
 SEEDS = st.integers(0, 2**32 - 1)
@@ -132,3 +136,22 @@ def test_a_room_is_drawn_from_its_seed_and_leaves_the_rest_as_it_is() -> None:
     assert drawn(5, room="L,furniture") == drawn(5, room="furniture,L") != drawn(6, room="L,furniture")
     assert recording_options(room="box").world == recording_options().world
     assert recording_options(room=["round", "furniture"]).world.room == ("round", "furniture")
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_primitives_and_clutter_have_the_sizes_that_are_wanted(seed: int) -> None:
+    """From the smallest to the largest, on a floor that holds them; none much thinner than the smallest."""
+    world = drawn(seed, sizes=(0.4, 1.5), size=(9, 9), per_kind=(1, 2), clutter=3)
+    extents = [primitive.kind.extent * max(primitive.size) for primitive in world.primitives]
+    thinnest = [primitive.kind.extent * min(primitive.size) for primitive in world.primitives]
+    assert min(extents) >= 0.4 - 1e-9 and max(extents) <= 1.5 + 1e-9 and min(thinnest) >= 0.8 * 0.4 - 1e-9
+    across = [max(np.ptp(np.array(solid.outline), axis=0)) for solid in world.clutter]
+    assert len(across) == 3 and all(0.4 / math.sqrt(2) < value < 1.5 * math.sqrt(2) for value in across)
+
+
+def test_all_scales_are_alike() -> None:
+    """As many from 0.05 to 0.5 m as from 0.5 to 5 m."""
+    rng = np.random.default_rng(0)
+    drawn_ones = [draw_primitive(rng, Kind.CIRCLE, (9.0, 9.0), (0.05, 5.0)) for _ in range(2000)]
+    small = np.mean([2 * primitive.size[0] < 0.5 for primitive in drawn_ones])
+    assert small == pytest.approx(0.5, abs=0.04)
