@@ -20,8 +20,9 @@ from detect.networks.weights import BATCHES, Weights, load_weight_set
 from detect.networks.yolo import KINDS, Boxes, Yolo, box_iou, non_maximum_suppression
 from mapping.grid import GridFrame, OccupancyGrid
 from mapping.morphology import isolated_boxes
-from mapping.pyramid import DEFAULT_SIZES, coarser, levels_for
 from mapping.pyramid import DEFAULTS as PYRAMID
+from mapping.pyramid import coarser, levels_for
+from prim.choices import DEFAULT_SIZES
 from prim.metrics import overlap_coefficient, polygon_iou
 from prim.world import Bounds
 

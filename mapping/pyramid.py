@@ -12,9 +12,6 @@ import numpy as np
 
 from mapping.grid import UNKNOWN, GridFrame, OccupancyGrid
 
-DEFAULT_SIZES = (0.05, 2.0)
-"""The smallest and the largest object that is looked for (m), by its longest side or its diameter."""
-
 Slices = tuple[slice, slice]
 
 

@@ -49,3 +49,7 @@ class PoseSourceName(StrEnum):
     TF = "tf"
     ODOM = "odom"
     FUSED = "fused"
+
+
+DEFAULT_SIZES = (0.05, 2.0)
+"""The smallest and the largest object that is looked for (m), by its longest side or its diameter."""

@@ -61,7 +61,7 @@ def record(
         int, typer.Option(metavar="N", min=0, help="The same seed and options write the same bytes.")
     ] = 0,
     world: Annotated[Path | None, typer.Option(metavar="WORLD.json", help="Read the world from this file.")] = None,
-    size: Annotated[
+    arena: Annotated[
         tuple[float, float] | None,
         typer.Option("--arena", "--size", metavar="X Y", help="Size of the floor, metres. [default: 2 2]"),
     ] = None,
@@ -162,7 +162,7 @@ def record(
     options = recording_options(
         seed=seed,
         world=world,
-        size=size,
+        arena=arena,
         walls=walls,
         kinds=kinds,
         per_kind=_parse_counts("--per-kind", per_kind),

@@ -43,14 +43,14 @@ LARGEST = {
     "clutter": 1e3,
     "at_walls": 1e3,
     "stops": 1e5,
-    "size": MAX_LENGTH,
+    "arena": MAX_LENGTH,
     "sizes": 1e3,
     "range_min": MAX_LENGTH,
     "range_max": MAX_LENGTH,
 }
 """The largest value of each option (m, rad, m/s, or a number); set by hand."""
 
-SMALLEST = {"size": 1e-2, "sizes": 1e-2, "speed": 1e-4}
+SMALLEST = {"arena": 1e-2, "sizes": 1e-2, "speed": 1e-4}
 """The smallest value of options (m, m/s) that else need only be above 0; set by hand."""
 
 MAX_BEAM_WIDTH = math.radians(30)
@@ -79,8 +79,8 @@ class RecordingKeywords(TypedDict, total=False):
     seed: int
     """The same seed and options write the same bytes."""
     world: str | Path | None
-    """A file that describes the world; it excludes all that is drawn, from size to touching."""
-    size: tuple[float, float] | None
+    """A file that describes the world; it excludes all that is drawn, from arena to touching."""
+    arena: tuple[float, float] | None
     """The floor, along x and y."""
     walls: bool | None
     """Whether there is a wall along each edge of the floor."""
@@ -169,13 +169,18 @@ def recording_options(**keywords: Unpack[RecordingKeywords]) -> SessionOptions:
     if "noise" in given:
         given["noise_std"] = PAPER_NOISE_UNIT * given["noise"]
     options = SessionOptions(
-        world=WorldOptions(**_some({**given, **converted}, _DRAWN)),
+        world=WorldOptions(**_drawn({**given, **converted})),
         lidar=Lidar(**_some(given, _LIDAR), faults=_faults(given)),
         **_some(given, _DIRECT),
         **{_FIELDS[name]: value for name, value in converted.items() if name in _FIELDS},
     )
     _check_scanner(options)
     return options
+
+
+def _drawn(given: Mapping[str, Any]) -> dict[str, Any]:
+    """Return what is given of a drawn world, by the fields of its options."""
+    return {"size" if name == "arena" else name: value for name, value in _some(given, _DRAWN).items()}
 
 
 def _faults(given: Mapping[str, Any]) -> ScannerFaults:
@@ -309,10 +314,10 @@ def _counts(name: str, counts: int | tuple[int, int]) -> tuple[int, int]:
 
 
 def _option(name: str) -> str:
-    return "--arena" if name == "size" else f"--{name.replace('_', '-')}"
+    return f"--{name.replace('_', '-')}"
 
 
-_DRAWN = ("size", "walls", "kinds", "per_kind", "sizes", "clutter", "room", "at_walls", "touching")
+_DRAWN = ("arena", "walls", "kinds", "per_kind", "sizes", "clutter", "room", "at_walls", "touching")
 _DRIVEN = ("duration", "speed", "movable", "odom_noise")
 _WARPED = ("stops",)
 _LIDAR = ("rays", "fov", "range_min", "range_max", "noise_std")
@@ -322,7 +327,7 @@ _FAULTS = {
 }
 """The fields of the scanner's faults by the names of their parameters."""
 _DIRECT = ("seed", "motion", "stops", "duration", "speed", "movable", "rate")
-_POSITIVE = ("size", "sizes", "stops", "duration", "speed", "rate", "rays", "fov", "range_max")
+_POSITIVE = ("arena", "sizes", "stops", "duration", "speed", "rate", "rays", "fov", "range_max")
 _NOT_NEGATIVE = (
     "range_min",
     "noise",

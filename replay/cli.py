@@ -17,9 +17,8 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
-from mapping.pyramid import DEFAULT_SIZES
 from prim import __version__, console
-from prim.choices import ClockName, MapperName, PoseSourceName, SensorModelName, SweepName
+from prim.choices import DEFAULT_SIZES, ClockName, MapperName, PoseSourceName, SensorModelName, SweepName
 from prim.errors import InterruptedRunError, PrimError, UsageError
 from prim.interrupts import interrupted_run
 

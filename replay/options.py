@@ -12,8 +12,7 @@ import numpy as np
 from detect.refinement.options import DEFAULTS as REFINEMENT
 from detect.refinement.options import RefinementOptions
 from mapping.mapper import check_cells, check_mapper, takes_noise
-from mapping.pyramid import DEFAULT_SIZES
-from prim.choices import ClockName, MapperName, PoseSourceName, SensorModelName, SweepName
+from prim.choices import DEFAULT_SIZES, ClockName, MapperName, PoseSourceName, SensorModelName, SweepName
 from prim.errors import UsageError
 from prim.se2 import Pose2D
 from prim.world import Bounds

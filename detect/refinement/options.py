@@ -14,7 +14,7 @@ import math
 from dataclasses import dataclass, field, fields, is_dataclass, replace
 from typing import Any
 
-from mapping.pyramid import DEFAULT_SIZES
+from prim.choices import DEFAULT_SIZES
 
 SCALED = "scaled"
 """Key of the fields' metadata that marks the lengths which go with the size of what is fitted."""

@@ -245,12 +245,28 @@ def session_options(options: DatasetOptions, seed: int) -> SessionOptions:
 
 
 def session_scale(options: DatasetOptions, seed: int) -> float:
-    """Draw how many times as large as at a scale of 1 a session is."""
+    """Draw how large a session is.
+
+    Args:
+        options: What is drawn from.
+        seed: Seed of the session.
+
+    Returns:
+        How many times as large as at a scale of 1.
+    """
     return float(np.random.default_rng((seed, 3)).choice(options.scales))
 
 
 def session_cell(options: DatasetOptions, seed: int) -> float:
-    """Draw the side (m) of the cells that a session is mapped with."""
+    """Draw the cells that a session is mapped with.
+
+    Args:
+        options: What is drawn from.
+        seed: Seed of the session.
+
+    Returns:
+        Their side (m).
+    """
     cells = options.cells or (options.resolution,)
     return session_scale(options, seed) * float(np.random.default_rng((seed, 4)).choice(cells))
 

@@ -16,13 +16,13 @@ class VisibilityOptions:
 
     Attributes:
         scans: Beams are measured in so many scans.
-        min_beams: Objects that fewer beams of a scan meet, at the median range, are hardly seen: the networks were
-            trained on objects of 50 mm that beams 35 mm apart meet.
+        min_beams: Objects that fewer beams of a scan meet, at the median range, are hardly seen from any number of
+            places: the networks were trained on objects of 50 mm that beams 35 mm apart meet.
         tolerance: Sizes that differ by a smaller share are the same.
     """
 
     scans: int = 40
-    min_beams: float = 1.0
+    min_beams: float = 0.5
     tolerance: float = 0.01
 
 
@@ -67,7 +67,7 @@ class Visibility:
         if by_cells > wanted:
             reasons.append(f"below {by_cells:.2g} m are less than {PYRAMID.fewest_cells:.0f} cells across")
         if by_beams > wanted:
-            reasons.append(f"below {by_beams:.2g} m pass between the beams of a scan at its median range")
+            reasons.append(f"below {by_beams:.2g} m are missed by every other scan at its median range")
         finer = ""
         if by_cells > wanted:
             finer = f", or finer cells with --resolution {smallest / PYRAMID.fewest_cells:.2g}"

@@ -11,7 +11,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from mapping.grid import GridFrame, OccupancyGrid
-from mapping.pyramid import DEFAULT_SIZES, coarser, levels_for
+from mapping.pyramid import coarser, levels_for
+from prim.choices import DEFAULT_SIZES
 
 
 def test_a_larger_cell_is_occupied_where_one_in_it_is_and_free_where_what_is_known_is() -> None:

@@ -78,7 +78,7 @@ def test_covers_of_known_shapes() -> None:
 @given(SEEDS)
 def test_ranges_to_clutter_and_structure_are_exact(seed: int) -> None:
     """Against shapely: the distance to the nearest point where a ray meets an outline."""
-    world = drawn(seed, clutter=3, per_kind=(0, 1), room="doorways,pilasters", size=(4, 4))
+    world = drawn(seed, clutter=3, per_kind=(0, 1), room="doorways,pilasters", arena=(4, 4))
     rng = np.random.default_rng(seed)
     origin = rng.uniform(-2, 2, 2)
     turn = rng.uniform(-math.pi, math.pi, 30)

@@ -34,7 +34,7 @@ def free_of(world: World) -> shapely.Geometry:
 @FEW
 @given(SEEDS, ROOMS, SIZES)
 def test_structure_is_on_the_floor_and_leaves_the_robot_room(seed: int, room: str, size: tuple[float, float]) -> None:
-    world = drawn(seed, room=room, size=size, per_kind=(0, 1), clutter=(0, 2))
+    world = drawn(seed, room=room, arena=size, per_kind=(0, 1), clutter=(0, 2))
     floor = shapely.box(*world.bounds)
     pieces = [shapely.Polygon(solid.outline) for solid in world.structure]
     assert all(piece.is_valid and floor.buffer(1e-6).contains(piece) for piece in pieces)
@@ -50,7 +50,7 @@ def test_structure_is_on_the_floor_and_leaves_the_robot_room(seed: int, room: st
 @FEW
 @given(SEEDS, ROOMS)
 def test_primitives_and_clutter_stand_in_the_free_apart_from_walls(seed: int, room: str) -> None:
-    world = drawn(seed, room=room, size=(4.0, 4.0), per_kind=(0, 1), clutter=2)
+    world = drawn(seed, room=room, arena=(4.0, 4.0), per_kind=(0, 1), clutter=2)
     for outline in outlines(world) + [shapely.Polygon(thing.outline) for thing in world.clutter]:
         assert outline.distance(walls(world)) >= GAP - 1e-9
         assert shapely.box(*world.bounds).contains(outline)
@@ -69,14 +69,14 @@ def test_a_round_room_is_round(seed: int) -> None:
 @FEW
 @given(SEEDS)
 def test_corridors_and_ls_have_their_areas(seed: int) -> None:
-    x0, y0, x1, y1 = free_of(drawn(seed, room="corridor", per_kind=0, size=(4, 3))).bounds
+    x0, y0, x1, y1 = free_of(drawn(seed, room="corridor", per_kind=0, arena=(4, 3))).bounds
     assert x1 - x0 == 4 and 0.3 * 3 - 1e-6 <= y1 - y0 <= 0.7 * 3 + 1e-6
     free = free_of(drawn(seed, room="L", per_kind=0))
     assert free.bounds == (-1, -1, 1, 1) and 4 * (1 - 0.36) - 1e-6 <= free.area <= 4 * (1 - 0.09) + 1e-6
 
 
 def test_rooms_have_what_they_are_asked_for() -> None:
-    worlds = [drawn(seed, room="doorways,pilasters,furniture", size=(4, 4), per_kind=0) for seed in range(40)]
+    worlds = [drawn(seed, room="doorways,pilasters,furniture", arena=(4, 4), per_kind=0) for seed in range(40)]
     names = [{solid.name for solid in world.structure} for world in worlds]
     assert all({"pilaster", "cupboard"} <= some <= {"wall", "pilaster", "cupboard"} for some in names)
     thin = [len(world.walls) > 4 for world in worlds]
@@ -90,7 +90,7 @@ def test_rooms_have_what_they_are_asked_for() -> None:
 
 @pytest.mark.parametrize("room", ["round", "L,doorways", "corridor,furniture"])
 def test_the_robot_stays_inside(room: str) -> None:
-    world = drawn(3, room=room, size=(4, 3), per_kind=(0, 1))
+    world = drawn(3, room=room, arena=(4, 3), per_kind=(0, 1))
     free = free_of(world)
     rng = np.random.default_rng(0)
     driven = drive(Simulator(world), rng, 0.5, 20, 0.3)
@@ -102,7 +102,7 @@ def test_the_robot_stays_inside(room: str) -> None:
 @FEW
 @given(SEEDS, st.sampled_from(["box", "round", "doorways"]), st.sampled_from([0.0, 0.03, 0.2]))
 def test_primitives_stand_at_walls(seed: int, room: str, gap: float) -> None:
-    world = drawn(seed, room=room, at_walls=gap, size=(4, 4), per_kind=1)
+    world = drawn(seed, room=room, at_walls=gap, arena=(4, 4), per_kind=1)
     for primitive in world.primitives:
         outline = shapely.Polygon(primitive.outline(4096))
         assert outline.distance(walls(world)) == pytest.approx(gap, abs=5e-6)
@@ -113,7 +113,7 @@ def test_primitives_stand_at_walls(seed: int, room: str, gap: float) -> None:
 @FEW
 @given(SEEDS)
 def test_pairs_touch_without_overlap_and_stand_apart_from_others(seed: int) -> None:
-    world = drawn(seed, touching=True, per_kind=(0, 1), size=(3, 3))
+    world = drawn(seed, touching=True, per_kind=(0, 1), arena=(3, 3))
     shapes = outlines(world, 4096)
     for index, shape in enumerate(shapes):
         for other, there in enumerate(shapes[:index]):
@@ -141,7 +141,7 @@ def test_a_room_is_drawn_from_its_seed_and_leaves_the_rest_as_it_is() -> None:
 @pytest.mark.parametrize("seed", range(4))
 def test_primitives_and_clutter_have_the_sizes_that_are_wanted(seed: int) -> None:
     """From the smallest to the largest, on a floor that holds them; none much thinner than the smallest."""
-    world = drawn(seed, sizes=(0.4, 1.5), size=(9, 9), per_kind=(1, 2), clutter=3)
+    world = drawn(seed, sizes=(0.4, 1.5), arena=(9, 9), per_kind=(1, 2), clutter=3)
     extents = [primitive.kind.extent * max(primitive.size) for primitive in world.primitives]
     thinnest = [primitive.kind.extent * min(primitive.size) for primitive in world.primitives]
     assert min(extents) >= 0.4 - 1e-9 and max(extents) <= 1.5 + 1e-9 and min(thinnest) >= 0.8 * 0.4 - 1e-9

@@ -71,7 +71,7 @@ class FakeDetector:
         self.objects = objects
         self.seen = 0
 
-    def detect(self, grid: OccupancyGrid) -> Detections:
+    def detect(self, grid: OccupancyGrid, *others: object) -> Detections:
         transient = [Primitive(Kind.CIRCLE, 0.9, -0.9, None, (0.05,))] if self.seen == 0 else []
         objects = self.objects[min(self.seen, len(self.objects) - 1)]
         self.seen += 1
@@ -208,7 +208,7 @@ def test_ids_are_unique_among_tracks_and_objects(noisy_session: Session, monkeyp
 def test_objects_without_primitives_are_numbered_from_one(
     noisy_session: Session, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(FakeDetector, "detect", lambda fake, grid: Detections((), (), objects=OBJECTS))
+    monkeypatch.setattr(FakeDetector, "detect", lambda fake, *others: Detections((), (), objects=OBJECTS))
     detector(monkeypatch, noisy_session)
     for every in ("end", 10):
         report = report_json(replayed(noisy_session, detect_every=every)[0])

@@ -87,7 +87,7 @@ def test_a_recording_that_rerun_cannot_finish_is_one_line_and_leaves_no_file(
 
 
 def test_a_replay_that_fails_leaves_no_file(tmp_path: Path, noisy_session: Session) -> None:
-    def fail(done: int, total: int) -> None:
+    def fail(stage: str, done: int, total: int) -> None:
         raise ZeroDivisionError
 
     viewer = RerunViewer(ViewerOptions(save=tmp_path / "a.rrd"), announce=print)

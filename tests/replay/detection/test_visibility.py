@@ -38,9 +38,10 @@ def test_what_is_less_than_five_cells_across_is_not_shown() -> None:
 
 
 def test_what_passes_between_beams_is_hardly_met() -> None:
-    """Half a degree at 12 m: 105 mm."""
-    said = note(0.01, (0.05, 2.0), 720, 12.0)
-    assert "below 0.1 m pass between the beams of a scan at its median range" in said and "--resolution" not in said
+    """Half a degree at 24 m: beams 209 mm apart."""
+    said = note(0.01, (0.05, 2.0), 720, 24.0)
+    assert "below 0.1 m are missed by every other scan at its median range" in said and "--resolution" not in said
+    assert not note(0.01, (0.05, 2.0), 360, 5.0)
 
 
 def test_the_note_is_given_once_and_its_hint_ends_it(noisy_session: Session) -> None:

@@ -120,7 +120,7 @@ socket.create_connection(("127.0.0.1", server.addresses.grpc_port), timeout=5)
 def test_a_replay_that_fails_is_served_no_longer(noisy_session: Session) -> None:
     lines: list[str] = []
 
-    def fail(done: int, total: int) -> None:
+    def fail(stage: str, done: int, total: int) -> None:
         raise ZeroDivisionError
 
     viewer = RerunViewer(ViewerOptions(serve=True), lines.append)
