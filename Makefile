@@ -5,6 +5,8 @@ BIN := .venv/bin
 OTHER_PYTHONS ?= 3.12 3.13
 SEED ?= 10
 NOISE_STD ?= 0.05
+# a process for each core; the tests of a file stay in one, whose fixtures they share
+PYTEST := -m pytest -q -n auto --dist loadfile
 
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
 
@@ -22,7 +24,7 @@ demo: .venv/installed
 	  *) exit 1 ;; esac
 
 test: lint
-	$(BIN)/python -m pytest -q
+	$(BIN)/python $(PYTEST)
 
 test-slow: .venv/installed-dev
 	$(BIN)/python -m pytest -q -m slow
@@ -31,16 +33,16 @@ test-slow: .venv/installed-dev
 
 test-train: .venv-train/installed
 	.venv-train/bin/python -c 'import matplotlib, onnx, onnxslim, torch, torchvision, ultralytics'
-	.venv-train/bin/python -m pytest -q tests/detect
+	.venv-train/bin/python $(PYTEST) tests/detect
 
 test-lowest: .venv-lowest/installed
-	.venv-lowest/bin/python -m pytest -q
+	.venv-lowest/bin/python $(PYTEST)
 
 test-pythons: $(OTHER_PYTHONS:%=test-python-%)
 
 test-python-%:
 	@if python=$$(.ci/find-python $* 2>&1); then \
-	  $(MAKE) --no-print-directory .venv-$*/installed PYTHON="$$python" && .venv-$*/bin/python -m pytest -q; \
+	  $(MAKE) --no-print-directory .venv-$*/installed PYTHON="$$python" && .venv-$*/bin/python $(PYTEST); \
 	else echo "skipped: $$python"; fi
 
 package: .venv/installed-dev
