@@ -154,6 +154,7 @@ def dataset(
         "rooms": tuple(room) if room else None,
         "faulty": faulty,
         "worlds": tuple(str(path) for path in world) if world else None,
+        "scales": (1.0,) if sizes or resolution or arena else None,
     }
     options = dataclasses.replace(
         DATASET_PRESETS[preset.value], **{name: value for name, value in given.items() if value is not None}
