@@ -65,7 +65,7 @@ class DetectorOptions:
     is larger; set by hand."""
 
     slack: float = 0.8
-    """What is by this factor smaller, or as much larger, than what is looked for in cells of one size counts, too:
+    """What is by this factor smaller, or as much larger, than what is searched for in cells of one size counts, too:
     the networks' sizes are not exact. Set by hand."""
 
     border: int = 2
@@ -99,8 +99,8 @@ class _SeenMap:
 
     Attributes:
         grid: The map, with cells as they know them.
-        tiles: The tiles that are looked at.
-        extents: From which to which extent (cells), from corner to corner, primitives are looked for.
+        tiles: The tiles that are searched.
+        extents: From which to which extent (cells), from corner to corner, primitives are searched for.
         scale: How many times as large its cells really are.
     """
 
@@ -169,7 +169,7 @@ class Detector:
 
         Args:
             grid: The map, with cells of any size.
-            sizes: The smallest and the largest size that is looked for (m): the longest side, or the diameter.
+            sizes: The smallest and the largest size that is searched for (m): the longest side, or the diameter.
             progress: Called after each tile with their number so far and in all.
 
         Returns:
@@ -229,7 +229,7 @@ class Detector:
         Args:
             images: Frames of tiles and their images (TILE_SIZE, TILE_SIZE, 3).
             frame: The map's frame, with cells as the networks know them.
-            extents: From which to which extent (cells), from corner to corner, primitives are looked for.
+            extents: From which to which extent (cells), from corner to corner, primitives are searched for.
 
         Returns:
             Detections, rejected and doubtful candidates.
@@ -254,7 +254,7 @@ class Detector:
             if better != i
         }
         reasons |= dict.fromkeys(excess.tolist(), f"its tile has {self.options.max_per_tile} better ones")
-        nowhere = "its tile holds no such primitive, or its size is looked for in other cells"
+        nowhere = "its tile holds no such primitive, or its size is searched for in other cells"
         reasons |= {i: nowhere for i in kept.tolist() if i not in estimated}
         rejections = {i: _rejection(boxes, i, frame, reason) for i, reason in reasons.items()}
         chosen = self._doubtful(boxes, whole & (suppressor < 0), kept)

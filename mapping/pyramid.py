@@ -17,10 +17,10 @@ Slices = tuple[slice, slice]
 
 @dataclass(frozen=True)
 class PyramidOptions:
-    """Which things are looked for in cells of which size.
+    """Which things are searched for in cells of which size.
 
     Attributes:
-        seen_cells: Things of up to so many cells across are looked for at a level; those that are larger at the next,
+        seen_cells: Things of up to so many cells across are searched for at a level; those that are larger at the next,
             in cells twice as large. The paper's largest square, 0.32 m in cells of 1 cm, is 45 across.
         fewest_cells: Things that are seen in fewer cells have no shape; set by hand.
         rounding: Relative rounding errors of resolutions.
@@ -41,7 +41,7 @@ class PyramidLevel:
     Attributes:
         factor: How many of the map's cells make one of its own, along each axis.
         resolution: The side of its cells (m).
-        extents: From which to which extent (m), from corner to corner, things are looked for in it.
+        extents: From which to which extent (m), from corner to corner, things are searched for in it.
     """
 
     factor: int

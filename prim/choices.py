@@ -52,4 +52,4 @@ class PoseSourceName(StrEnum):
 
 
 DEFAULT_SIZES = (0.05, 2.0)
-"""The smallest and the largest object that is looked for (m), by its longest side or its diameter."""
+"""The smallest and the largest object that is searched for (m), by its longest side or its diameter."""

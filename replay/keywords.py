@@ -60,7 +60,7 @@ class ReplayKeywords(TypedDict, total=False):
     detect_every: int | Literal["end"] | None
     refine: bool
     sizes: tuple[float, float]
-    """The smallest and the largest object that is looked for (m), by its longest side or its diameter."""
+    """The smallest and the largest object that is searched for (m), by its longest side or its diameter."""
     closed_world: bool
     weights: str | Path | None
     recover: bool

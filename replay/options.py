@@ -31,7 +31,7 @@ MIN_POSE_NOISE, MAX_POSE_NOISE = 1e-9, 1e6
 """The smallest and the largest standard deviations of poses (m, rad) that can be given; set by hand."""
 
 MIN_SIZE, MAX_SIZE = 1e-3, 100.0
-"""The smallest and the largest object (m) that can be looked for; set by hand."""
+"""The smallest and the largest object (m) that can be searched for; set by hand."""
 
 MAX_TURN = 2 * math.pi
 """The largest turn (rad) of a laser on its robot: larger ones are degrees given as radians."""
@@ -74,7 +74,7 @@ class ReplayOptions:
         detect_every: N to detect primitives after the first scan, after every N scans, and at the end; «end» for the
             end only; None for eight times where the replay is shown, else the end only.
         refine: Whether detections are refined with the rays.
-        sizes: The smallest and the largest object that is looked for (m), by its longest side or its diameter.
+        sizes: The smallest and the largest object that is searched for (m), by its longest side or its diameter.
         closed_world: Whether all that stands there is taken to be one of the kinds, or a wall; else what is likeliest
             none of the kinds is an object without one.
         weights: The weights of the detector; None for those that come with prim.

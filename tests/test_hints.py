@@ -251,7 +251,7 @@ NOT_IN_TABLES = {
     "(try: {} --help)": ABOVE,
     "m is too large to drive on: give": ABOVE,
     "such as --sizes 0.05 2": "tests/replay/detection/test_visibility.py",
-    "look for those that are shown with --sizes": "tests/replay/detection/test_visibility.py",
+    "search for those that are shown with --sizes": "tests/replay/detection/test_visibility.py",
     ", or finer cells with --resolution": "tests/replay/detection/test_visibility.py",
     "change to another one": USERS,
     "choose another place": USERS,

@@ -263,7 +263,7 @@ class EvidenceOptions:
     thinnest: float = 0.2
     """The prior's lower bound of each size, as a share of the smallest object."""
     max_extent: float = scaled(1.0)
-    """m; no fit is larger: something above the 0.7 m of what is looked for at this scale."""
+    """m; no fit is larger: something above the 0.7 m of what is searched for at this scale."""
     contender: float = 7.0
     """nats; kinds within this of the best one's Laplace approximation are sampled: e^-7 is below 0.1 %."""
     mode_margin: float = 9.0

@@ -71,5 +71,5 @@ class Visibility:
         finer = ""
         if by_cells > wanted:
             finer = f", or finer cells with --resolution {smallest / PYRAMID.fewest_cells:.2g}"
-        hint = f"look for those that are shown with --sizes {shown:.2g} {max(largest, 2.5 * shown):.2g}{finer}"
+        hint = f"search for those that are shown with --sizes {shown:.2g} {max(largest, 2.5 * shown):.2g}{finer}"
         return f"objects {' and '.join(reasons)}: {hint}"

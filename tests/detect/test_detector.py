@@ -150,7 +150,7 @@ def test_what_only_another_size_of_cells_shows_differently_is_a_rival() -> None:
         assert polygon_iou(rival.primitive, found.found[0].primitive) < 0.8
 
 
-def test_a_map_of_walls_is_looked_at_where_things_stand_isolated() -> None:
+def test_a_map_of_walls_is_searched_where_things_stand_isolated() -> None:
     """A large room with one thing in it: few tiles of many."""
     grid = grid_with((8.0, 5.0), rows=1200, cols=1600)
     probability = grid.probability.copy()

@@ -63,7 +63,7 @@ def test_levels_cover_all_sizes_without_a_gap(resolution: float, smallest: float
     assert levels[0].factor == 1 or 5 * levels[0].resolution <= smallest * (1 + 1e-6)
 
 
-def test_what_is_looked_for_by_default() -> None:
+def test_what_is_searched_for_by_default() -> None:
     assert [level.factor for level in levels_for(0.01, DEFAULT_SIZES)] == [1, 2, 4, 8]
     assert [level.factor for level in levels_for(0.05, DEFAULT_SIZES)] == [1, 2]
     assert [level.factor for level in levels_for(0.01, (0.5, 2.0))] == [8]

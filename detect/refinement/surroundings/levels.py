@@ -21,7 +21,7 @@ class MapLevel:
     """A map at one size of its cells.
 
     Attributes:
-        level: The cells' size, and which things are looked for in them.
+        level: The cells' size, and which things are searched for in them.
         grid: The map.
         options: Numbers for these things.
     """

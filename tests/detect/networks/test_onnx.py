@@ -327,7 +327,7 @@ def box_output(*columns: tuple[float, float, float, float, float]) -> NDArray[np
 GOOD = (100.0, 100.0, 30.0, 30.0, 0.9)
 
 SMALL = (0.05, 0.3)
-"""m; sizes that are looked for in cells of one size."""
+"""m; sizes that are searched for in cells of one size."""
 
 
 @pytest.mark.parametrize("at", range(9))
@@ -381,7 +381,7 @@ def test_primitives_that_no_tile_holds_are_rejected(tmp_path: Path, value: float
     files = {"yolo": write_network(detector(box_output(GOOD))), "cnn": write_network(parameters(floats(value)))}
     found = Detector.load(folder_with(tmp_path, **files)).detect(a_map(), SMALL)
     assert not found.found and [rejection.reason for rejection in found.rejected] == [
-        "its tile holds no such primitive, or its size is looked for in other cells"
+        "its tile holds no such primitive, or its size is searched for in other cells"
     ]
 
 

@@ -33,7 +33,7 @@ def test_nothing_is_said_where_all_can_be_seen() -> None:
 
 def test_what_is_less_than_five_cells_across_is_not_shown() -> None:
     said = note(0.05, (0.05, 2.0))
-    assert said.startswith("objects below 0.25 m are less than 5 cells across: look for those that are shown with ")
+    assert said.startswith("objects below 0.25 m are less than 5 cells across: search for those that are shown with ")
     assert "--sizes 0.25 2" in said and "--resolution 0.01" in said
 
 
@@ -46,7 +46,7 @@ def test_what_passes_between_beams_is_hardly_met() -> None:
 
 def test_the_note_is_given_once_and_its_hint_ends_it(noisy_session: Session) -> None:
     (said,) = notes_of(noisy_session.path, ReplayOptions(resolution=0.05, sizes=(0.05, 2.0), bounds=BOUNDS))
-    suggested = said.partition("look for those that are shown with ")[2].split(",")[0].split()
+    suggested = said.partition("search for those that are shown with ")[2].split(",")[0].split()
     assert suggested[0] == "--sizes"
     smallest, largest = map(float, suggested[1:3])
     options = ReplayOptions(resolution=0.05, sizes=(smallest, largest), bounds=BOUNDS)
