@@ -20,8 +20,8 @@ class PyramidOptions:
     """Which things are searched for in cells of which size.
 
     Attributes:
-        seen_cells: Things of up to so many cells across are searched for at a level; those that are larger at the next,
-            in cells twice as large. The paper's largest square, 0.32 m in cells of 1 cm, is 45 across.
+        seen_cells: Things of up to so many cells across are searched for at a level; those that are larger at the
+            next, in cells twice as large. The paper's largest square, 0.32 m in cells of 1 cm, is 45 across.
         fewest_cells: Things that are seen in fewer cells have no shape; set by hand.
         rounding: Relative rounding errors of resolutions.
     """
