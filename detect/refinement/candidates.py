@@ -57,6 +57,7 @@ class Candidate:
             scanner; None for none.
         outline: Vertices (V, 2) in m of a free outline, where the rays say that no kind fits; else None.
         rivals: Candidates that would stand in its place, and do not occlude it.
+        around: The rays that pass its circle, where ``bundle`` has only those near its outline.
         current: The primitive as far as it is known.
     """
 
@@ -74,6 +75,7 @@ class Candidate:
     shared_errors: FloatArray | None = None
     outline: FloatArray | None = None
     rivals: list[Candidate] = field(default_factory=list)
+    around: RayBundle | None = None
     current: Primitive = field(init=False)
     _cached: tuple[Background, tuple[float, float], FloatArray] | None = None
     _passed: dict[int, tuple[Candidate, bool]] = field(default_factory=dict)

@@ -147,9 +147,8 @@ def larger_alternatives(
     """
     options = candidate.options
     outline, found = primitive.outline(), []
-    contact = contact_of(
-        primitive, candidate.bundle, candidate.cells, others, candidate.walls, sensor, options.contact
-    )
+    rays = candidate.bundle if candidate.around is None else candidate.around
+    contact = contact_of(primitive, rays, candidate.cells, others, candidate.walls, sensor, options.contact)
     if contact.cells:
         nats = contact.nats
         reason = f"a part of something larger: its rays are likelier by {nats:.0f} nats with what touches it"

@@ -630,6 +630,7 @@ class Refinement:
     def _near_rays(self, candidates: list[Candidate]) -> list[Candidate]:
         """Leave out rays that pass far from the fits, and candidates without any."""
         for candidate in candidates:
+            candidate.around = candidate.bundle
             candidate.keep_rays(candidate.bundle.passing(candidate.current, candidate.options.rays.fitted_reach))
         return [candidate for candidate in candidates if len(candidate.bundle)]
 
