@@ -210,6 +210,7 @@ class Detector:
         found, overlapping = _reject_overlapping(best, self.options.max_overlap)
         rivals = [pair for pair in overlapping if self._differs(pair[0], found)]
         doubtful = [pair for part in parts for pair in part.doubtful if self._differs(pair[0], found)]
+        doubtful = sorted(doubtful, key=lambda pair: -pair[0].score)[: self.options.max_doubtful]
         rejected = [*(rejection for _, rejection in overlapping), *(one for part in parts for one in part.rejected)]
         return Detections(found, _best_first(rejected), tuple(doubtful), tuple(rivals))
 

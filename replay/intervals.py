@@ -17,7 +17,7 @@ DETECTIONS = 8
 """By default primitives are detected so many times at most, after the first and the last scan too. Set by hand: a
 replay takes at most 40 % more time than with one detection at the end (`python -m bench.speed`)."""
 
-DETECTED_CELLS = 40_000_000
+DETECTED_CELLS = 3_000_000
 """By default no more cells than this are searched for primitives in all detections along the way: the time that these
 take grows with the cells. Set by hand."""
 
