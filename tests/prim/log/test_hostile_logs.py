@@ -102,7 +102,9 @@ def test_a_frame_that_refers_back_too_far_is_refused_before_it_takes_memory(tmp_
         LogFile(path)
 
 
-@pytest.mark.parametrize("nothing", [gzip.compress(b"", mtime=0), zstandard.compress(b""), b"\x50\x2a\x4d\x18\0\0\0\0"])
+@pytest.mark.parametrize(
+    "nothing", [gzip.compress(b"", mtime=0), zstandard.compress(b""), b"\x50\x2a\x4d\x18\0\0\0\0"]
+)
 def test_very_many_frames_of_nothing_are_nothing(tmp_path: Path, nothing: bytes) -> None:
     with pytest.raises(LogReadError, match="empty: "):
         LogFile(written(tmp_path, nothing * 1000))

@@ -78,7 +78,9 @@ def test_what_ends_early_is_said_and_recovered(tmp_path: Path, compress: Compres
 
 
 @pytest.mark.parametrize("recover", [False, True])
-@pytest.mark.parametrize("packed", [gzip.compress(b"", mtime=0), zstandard.compress(b""), gzip.compress(CONTENT, mtime=0)[:9]])
+@pytest.mark.parametrize(
+    "packed", [gzip.compress(b"", mtime=0), zstandard.compress(b""), gzip.compress(CONTENT, mtime=0)[:9]]
+)
 def test_nothing_inside_is_one_clear_line(tmp_path: Path, packed: bytes, recover: bool) -> None:
     path = tmp_path / "log"
     path.write_bytes(packed)
