@@ -205,7 +205,7 @@ def measured(log: Path, options: ReplayOptions) -> Row:
         labels = [Primitive.from_json(value) for value in strict_json.loads(beside.read_bytes())]
         found = [detection.primitive for detection in whole.detections.found]
         row.labels = len(labels)
-        row.recalled = sum(pair.iou >= FOUND_IOU for pair in match_primitives(found, labels))
+        row.recalled = sum(pair.same_kind and pair.iou >= FOUND_IOU for pair in match_primitives(found, labels))
     return row
 
 
