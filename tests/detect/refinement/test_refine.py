@@ -16,6 +16,7 @@ from detect.refinement.candidates import Candidate, find_backgrounds, fit_candid
 from detect.refinement.fitting.evidence import compare_kinds, exact_costs
 from detect.refinement.fitting.fit import KindFit, other_apexes, refit, starts
 from detect.refinement.likelihood.geometry import JACOBIANS, parameters_of, primitive_of
+from detect.refinement.likelihood.kernels import FAR, OCCLUSION
 from detect.refinement.likelihood.rays import RayBundle, RayCollector, collect_rays
 from detect.refinement.likelihood.sensor_model import (
     BeamModel,
@@ -483,3 +484,28 @@ def test_a_triangle_with_few_rays_may_have_another_apex() -> None:
     assert {round(turn) % 3 for turn in turns} == {0, 1, 2}
     posterior = compare_kinds(modes, beams, sensor)
     assert posterior is not None and posterior.std["theta"] > 0.5
+
+
+def test_rivals_do_not_occlude_each_other() -> None:
+    """What would stand in a candidate's place hides none of its rays; what stands before it does."""
+    true = shape(Kind.SQUARE)
+    taken = scans(room(true), 0.01)
+    (beams,), span, _ = collect_rays(taken, [true], 0.07)
+    cells = MapLevels.of(mapped(taken)).levels[0].cells
+    one, other = Candidate(true, beams, cells), Candidate(replace(true, size=(0.3,)), beams, cells)
+    with ThreadPoolExecutor(1) as pool:
+        find_backgrounds(pool, [one, other], is_first=True)
+    sensor = BeamModel.create(0.01, span)
+    assert (one.rays_with_background([one, other], sensor).rays[OCCLUSION] < FAR).any()
+    fresh = Candidate(true, beams, cells, background=one.background, rivals=[other])
+    alone = fresh.rays_with_background([fresh], sensor).rays[OCCLUSION]
+    assert (fresh.rays_with_background([fresh, other], sensor).rays[OCCLUSION] == alone).all()
+
+
+def test_numbers_grow_with_the_cells_but_for_those_of_the_sensor() -> None:
+    large = DEFAULTS.at_scale(5.0)
+    assert DEFAULTS.at_scale(1.0) is DEFAULTS
+    assert large.rays.reach == 5 * DEFAULTS.rays.reach and large.map.min_wall == 5 * DEFAULTS.map.min_wall
+    assert large.fit.coarse.blurs == tuple(5 * blur for blur in DEFAULTS.fit.coarse.blurs)
+    assert large.sensor == DEFAULTS.sensor and large.scanner == DEFAULTS.scanner
+    assert large.evidence.sizes == DEFAULTS.evidence.sizes and large.contact.touch == DEFAULTS.contact.touch

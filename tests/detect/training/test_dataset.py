@@ -12,12 +12,14 @@ import pytest
 
 from detect.training.crops import collect_crops
 from detect.training.dataset import (
+    DATASET_PRESETS,
     DatasetOptions,
     data_description,
     image_style,
     load_samples,
     make_dataset,
     read_image,
+    session_cell,
     session_options,
     session_seeds,
     write_image,
@@ -164,3 +166,44 @@ def test_a_file_that_cannot_be_written_is_named(tmp_path: Path) -> None:
     place.mkdir(parents=True)
     with pytest.raises(OutputError, match=r"000003_0\.png: cannot write"):
         make_dataset(tmp_path, options)
+
+
+def test_cells_of_any_size_are_written_as_the_networks_know_them(tmp_path: Path) -> None:
+    """Five times as large, in cells that are: outlines lie on occupied cells, and have the sizes of cells of 1 cm."""
+    options = replace(
+        DATASET_PRESETS["open"],
+        sizes=(3, 0),
+        mappers=("det",),
+        noise_stds=(0.0,),
+        scales=(5.0,),
+        faulty=0.0,
+        rays=(500,),
+        fovs=(6.28,),
+        stops=(8,),
+        motions=("warp",),
+        seed=31,
+    )
+    make_dataset(tmp_path / "set", options, workers=1)
+    outlines = 0
+    for sample in load_samples(tmp_path / "set", "det", "train"):
+        occupied = read_image(sample)[..., 0] > 200
+        near = cv2.dilate(occupied.astype(np.uint8), np.ones((5, 5), np.uint8))
+        for primitive in sample.primitives:
+            assert 0.04 < primitive.kind.extent * max(primitive.size) <= 0.5 + 1e-9
+            places = primitive.outline() / sample.frame.resolution - (sample.frame.col, sample.frame.row)
+            cols, rows = np.clip(places, 0, 223).astype(int).T
+            assert near[rows, cols].mean() > 0.4
+            outlines += 1
+    assert outlines > 4
+    assert {session_cell(options, seed) for _, seed in session_seeds(options)} == {0.05}
+
+
+def test_sessions_of_earlier_presets_are_drawn_as_ever() -> None:
+    """What real places have comes from generators of its own."""
+    seed = 200_003
+    old, more = session_options(DATASET_PRESETS["mixed"], seed), replace(DATASET_PRESETS["mixed"], clutter=(0, 4))
+    new = session_options(replace(more, fovs=(3.0, 4.0), faulty=1.0), seed)
+    assert (old.lidar.rays, old.lidar.noise_std, old.stops, old.motion) == (
+        new.lidar.rays, new.lidar.noise_std, new.stops, new.motion,
+    )  # fmt: skip
+    assert new.lidar.fov in (3.0, 4.0) and new.lidar.faults != old.lidar.faults
