@@ -4,7 +4,7 @@
         [--pictures DIR] [--update docs/real.md]
 
 Each log of a folder is replayed as ``prim-replay`` does, with all its scans and without detection, and by its even
-and its odd scans alone. A primitive is told where its score is 0.9 at least. It stands free where most cells around
+and its odd scans alone. A primitive is confident where its score is 0.9 at least. It stands free where most cells around
 it are; it agrees where the other half has one of its kind whose place and sizes are the same within 3 standard
 deviations of the difference. A file NAME.labels.json beside a log, a list of primitives as reports have them, gives
 the recall.
@@ -40,7 +40,7 @@ from replay.options import ReplayOptions
 from replay.pipeline import Pipeline
 from replay.scans.selection import Selection
 
-TOLD = 0.9
+CONFIDENT = 0.9
 FREE_SHARE = 0.65
 DEVIATIONS = 3.0
 RING_CELLS = 2.5
@@ -69,9 +69,9 @@ class Found:
     stamps: tuple[int, int] = (0, 0)
 
     @property
-    def told(self) -> list[Detection]:
-        """The primitives that are told."""
-        return [detection for detection in self.detections.found if detection.score >= TOLD]
+    def confident(self) -> list[Detection]:
+        """The primitives whose score is high."""
+        return [detection for detection in self.detections.found if detection.score >= CONFIDENT]
 
 
 def replayed(log: Path, options: ReplayOptions) -> Found:
@@ -138,9 +138,9 @@ def agree(one: Detection, other: Detection) -> bool:
     )
 
 
-def agreeing(told: Sequence[Detection], others: Sequence[Detection]) -> int:
+def agreeing(confident: Sequence[Detection], others: Sequence[Detection]) -> int:
     """Count the primitives of one half that the other has too."""
-    return sum(any(agree(detection, other) for other in others) for detection in told)
+    return sum(any(agree(detection, other) for other in others) for detection in confident)
 
 
 @dataclass
@@ -152,7 +152,7 @@ class Row:
         whole: By all scans.
         cost: What that takes.
         plain: What it takes without detection.
-        told: Primitives told by either half.
+        confident: Confident primitives of either half.
         alike: How many of these the other half has.
         labels: How many labels there are; None where the log has none.
         recalled: How many of these were found.
@@ -162,28 +162,28 @@ class Row:
     whole: Found
     cost: Cost
     plain: Cost
-    told: int
+    confident: int
     alike: int
     labels: int | None = None
     recalled: int = 0
     free: int = field(init=False)
 
     def __post_init__(self) -> None:
-        self.free = sum(stands_free(detection, self.whole.grid) for detection in self.whole.told)
+        self.free = sum(stands_free(detection, self.whole.grid) for detection in self.whole.confident)
 
     def cells(self) -> list[str]:
         """Return the cells of the row."""
-        told = len(self.whole.told)
+        confident = len(self.whole.confident)
         recall = "" if self.labels is None else f"{self.recalled} of {self.labels}"
         return [
-            self.log, str(len(self.whole.detections.found)), str(len(self.whole.detections.objects)), str(told),
-            f"{self.free} of {told}", f"{self.alike} of {self.told}", recall,
+            self.log, str(len(self.whole.detections.found)), str(len(self.whole.detections.objects)), str(confident),
+            f"{self.free} of {confident}", f"{self.alike} of {self.confident}", recall,
             f"{self.cost.cpu:.1f}", f"{self.cost.cpu / self.plain.cpu:.1f}", f"{self.cost.memory:.0f}",
         ]  # fmt: skip
 
 
 HEADING = (
-    "log", "primitives", "objects", "told (≥ 0.9)", "of these free-standing", "told by a half: the other agrees",
+    "log", "primitives", "objects", "score ≥ 0.9", "of these free-standing", "≥ 0.9 by a half: the other agrees",
     "labels found", "CPU with a recording, s", "× without detection", "memory, MB",
 )  # fmt: skip
 
@@ -197,9 +197,9 @@ def measured(log: Path, options: ReplayOptions) -> Row:
         replayed(log, replace(options, selection=selection))
         for selection in (Selection(stride=2), Selection(start=apart / 2, stride=2))
     ]
-    told = sum(len(half.told) for half in halves)
-    alike = sum(agreeing(a.told, b.detections.found) for a, b in (halves, halves[::-1]))
-    row = Row(log.name, whole, cost, plain, told, alike)
+    confident = sum(len(half.confident) for half in halves)
+    alike = sum(agreeing(a.confident, b.detections.found) for a, b in (halves, halves[::-1]))
+    row = Row(log.name, whole, cost, plain, confident, alike)
     beside = log.with_name(f"{log.name.split('.')[0]}.labels.json")
     if beside.exists():
         labels = [Primitive.from_json(value) for value in strict_json.loads(beside.read_bytes())]

@@ -155,8 +155,10 @@ class Candidate:
         return KindFit(kind, parameters_of(self.start), 0.0, np.eye(JACOBIANS[kind].shape[1]))
 
     def is_possible(self, primitive: Primitive) -> bool:
-        """Tell whether a primitive in its place keeps off walls and is no larger than the prior allows."""
-        if max(parameters_of(primitive)[3:]) >= size_bounds(primitive.kind, self.options.evidence)[1]:
+        """Tell whether a primitive in its place keeps off walls and is of a size that is wanted."""
+        prior, longest = self.options.evidence, max(parameters_of(primitive)[3:])
+        is_small = longest * primitive.kind.extent < prior.smallest_extent
+        if is_small or longest >= size_bounds(primitive.kind, prior)[1]:
             return False
         own = (wall for wall in self.walls if wall.behind is self.start)
         depth = self.options.walls.depth

@@ -308,6 +308,11 @@ class EvidenceOptions:
         return self.thinnest * smallest, min(self.size_margin * largest, self.max_extent)
 
     @property
+    def smallest_extent(self) -> float:
+        """The least longest side, or diameter (m), of an object that is wanted."""
+        return self.sizes[0] / self.size_margin
+
+    @property
     def log_size_density(self) -> float:
         """The log of the prior density of a size's logarithm, which is uniform over all scales."""
         smallest, largest = self.sizes

@@ -279,9 +279,7 @@ def rejection_reason(result: RefinedPrimitive | None, limits: AcceptanceOptions 
         The reason; empty where they do not.
     """
     if result is None:
-        return (
-            "the rays speak against it, a likelier one stands in its place, or it is too large or reaches into a wall"
-        )
+        return "the rays speak against it, a likelier one stands in its place, or its size is not wanted or it reaches into a wall"
     if result.log_ratio < limits.min_log_ratio:
         return (
             f"the rays are likelier with it by {result.log_ratio:.0f} nats only, less than {limits.min_log_ratio:g}"
