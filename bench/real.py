@@ -4,8 +4,8 @@
         [--pictures DIR] [--update docs/real.md]
 
 Each log of a folder is replayed as ``prim-replay`` does, with all its scans and without detection, and by its even
-and its odd scans alone. A primitive is confident where its score is 0.9 at least. It stands free where most cells around
-it are; it agrees where the other half has one of its kind whose place and sizes are the same within 3 standard
+and its odd scans alone. A primitive is confident where its score is 0.9 at least. It stands free where most cells
+around it are; it agrees where the other half has one of its kind whose place and sizes are the same within 3 standard
 deviations of the difference. A file NAME.labels.json beside a log, a list of primitives as reports have them, gives
 the recall.
 """

@@ -279,7 +279,10 @@ def rejection_reason(result: RefinedPrimitive | None, limits: AcceptanceOptions 
         The reason; empty where they do not.
     """
     if result is None:
-        return "the rays speak against it, a likelier one stands in its place, or its size is not wanted or it reaches into a wall"
+        return (
+            "the rays speak against it, a likelier one stands in its place, its size is not wanted, or it reaches into "
+            "a wall"
+        )
     if result.log_ratio < limits.min_log_ratio:
         return (
             f"the rays are likelier with it by {result.log_ratio:.0f} nats only, less than {limits.min_log_ratio:g}"
@@ -443,7 +446,7 @@ class Refinement:
 
         Returns:
             Each refined, in the order given; None for one that no ray passes, that is the duplicate of another, or
-            that is too large or reaches into a wall.
+            whose size is not wanted, or that reaches into a wall.
         """
         if not primitives:
             return []

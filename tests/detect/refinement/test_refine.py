@@ -408,7 +408,7 @@ def test_reasons_name_the_limit() -> None:
     assert "by 3 nats only" in rejection_reason(made)
     assert "in the map alone" in rejection_reason(replace(made, log_ratio=100.0, misfit=2.0))
     assert "not known to within 25%" in rejection_reason(replace(made, log_ratio=100.0, std={"side": 0.06}))
-    assert rejection_reason(replace(made, log_ratio=100.0)) == "" and "too large" in rejection_reason(None)
+    assert rejection_reason(replace(made, log_ratio=100.0)) == "" and "not wanted" in rejection_reason(None)
 
 
 def test_pieces_of_a_scan_count_as_one_scan() -> None:
