@@ -280,8 +280,8 @@ def rejection_reason(result: RefinedPrimitive | None, limits: AcceptanceOptions 
     """
     if result is None:
         return (
-            "the rays speak against it, a likelier one stands in its place, its size is not wanted, or it reaches into "
-            "a wall"
+            "the rays speak against it, a likelier one stands in its place, its size is not wanted, "
+            "or it reaches into a wall"
         )
     if result.log_ratio < limits.min_log_ratio:
         return (
