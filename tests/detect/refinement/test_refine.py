@@ -509,3 +509,14 @@ def test_numbers_grow_with_the_cells_but_for_those_of_the_sensor() -> None:
     assert large.fit.coarse.blurs == tuple(5 * blur for blur in DEFAULTS.fit.coarse.blurs)
     assert large.sensor == DEFAULTS.sensor and large.scanner == DEFAULTS.scanner
     assert large.evidence.sizes == DEFAULTS.evidence.sizes and large.contact.touch == DEFAULTS.contact.touch
+
+
+def test_what_is_smaller_than_what_is_wanted_is_not_possible() -> None:
+    """Bounds are meant within a quarter: 0.25 m is possible where 0.3 m is wanted, 0.2 m is not."""
+    wanted = replace(DEFAULTS, evidence=replace(DEFAULTS.evidence, sizes=(0.3, 2.0)))
+    grid = mapped(scans(room(shape(Kind.SQUARE)), 0.01))
+    (beams,), _, _ = collect_rays([], [shape(Kind.SQUARE)], 0.07)
+    for side, possible in ((0.25, True), (0.2, False)):
+        one = Primitive(Kind.SQUARE, 0.0, 0.0, 0.4, (side,))
+        candidate = Candidate(one, beams, MapLevels.of(grid).levels[0].cells, options=wanted)
+        assert candidate.is_possible(one) is possible
