@@ -51,6 +51,7 @@ class CnnPreset(StrEnum):
     PRIM = "prim"
     PAPER = "paper"
     MORE = "more"
+    OPEN = "open"
 
 
 class YoloPreset(StrEnum):
@@ -60,6 +61,7 @@ class YoloPreset(StrEnum):
     PAPER = "paper"
     DRAWINGS = "drawings"
     MORE = "more"
+    OPEN = "open"
 
 
 def _show_version(wanted: bool) -> None:

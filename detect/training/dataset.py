@@ -161,7 +161,7 @@ DATASET_PRESETS = {
 DATASET_PRESETS["large"] = replace(DATASET_PRESETS["mixed"], sizes=(2400, 60), seed=210_000)
 DATASET_PRESETS["open"] = replace(
     DATASET_PRESETS["mixed"],
-    sizes=(2400, 120),
+    sizes=(800, 60),
     seed=220_000,
     noise_stds=(0.0, 0.01, 0.02, 0.03, 0.05, 0.075, 0.1, 0.25, 0.375, 0.5),
     rays=(180, 360, 500, 1000),

@@ -21,9 +21,9 @@ from detect.training.thresholds import choose_thresholds
 from prim.errors import UsageError
 from prim.shapes import Kind
 
-MIXED, LARGE = DATASET_PRESETS["mixed"], DATASET_PRESETS["large"]
-"""The data set that the first mapper's networks are trained on; and the one that each mapper's training is continued
-on."""
+MIXED, LARGE, OPEN = (DATASET_PRESETS[name] for name in ("mixed", "large", "open"))
+"""The data set that the first mapper's networks are trained on; and the two that each mapper's training is continued
+on, one after the other."""
 
 MIN_REPORTED_TIME = 5.0
 """Steps that take no longer (s) found their results there already and are not reported."""
@@ -198,7 +198,7 @@ def train_all(work: Path, mappers: Sequence[str], announce: Announce) -> Iterato
     """Train the weights that come with prim.
 
     The networks of FIRST_MAPPER are trained from drawings; those of each mapper continue from these on more sessions,
-    since all maps look alike.
+    since all maps look alike, and then on real places.
 
     Args:
         work: Folder of data sets, training and weights.
@@ -212,9 +212,12 @@ def train_all(work: Path, mappers: Sequence[str], announce: Announce) -> Iterato
     first = train_weights(mixed, FIRST_MAPPER, work / "first", "prim", start, announce, provenance(MIXED))
     yolo, cnn = first / "yolo" / "weights" / "best.pt", first / f"cnn.{FIRST_MAPPER}.pt"
     large = ensure_dataset(work / "large", LARGE, announce)
+    places = ensure_dataset(work / "open", OPEN, announce)
     for mapper in mappers:
+        more = train_weights(large, mapper, work / "more" / mapper, "more", yolo, announce, provenance(LARGE), cnn)
+        best, checkpoint = more / "yolo" / "weights" / "best.pt", more / f"cnn.{mapper}.pt"
         folder = work / "weights" / mapper
-        yield train_weights(large, mapper, folder, "more", yolo, announce, provenance(LARGE), cnn)
+        yield train_weights(places, mapper, folder, "open", best, announce, provenance(OPEN), checkpoint)
 
 
 def provenance(options: DatasetOptions) -> dict[str, Any]:

@@ -87,10 +87,11 @@ class CnnOptions:
 CNN_PRESETS = {
     PRIM.name: CnnOptions(),
     "more": CnnOptions(epochs=10, learning_rate=0.0005),
+    "open": CnnOptions(epochs=10, learning_rate=0.0003),
     PAPER.name: CnnOptions(PAPER.name, epochs=20, vary=False),
 }
-"""``prim`` trains from random weights (set by hand), ``more`` continues on more sessions; ``paper``: IV-B, 20 epochs,
-batch 128, Adam, learning rate 0.001, without augmentation."""
+"""``prim`` trains from random weights (set by hand), ``more`` continues on more sessions, ``open`` on real
+places; ``paper``: IV-B, 20 epochs, batch 128, Adam, learning rate 0.001, without augmentation."""
 
 
 def network_kinds(preset: str, kinds: Sequence[Kind]) -> list[tuple[Kind, ...]]:
@@ -349,11 +350,13 @@ class YoloOptions:
 YOLO_PRESETS = {
     "prim": YoloOptions(),
     "more": YoloOptions(epochs=24, learning_rate=0.001),
+    "open": YoloOptions(epochs=10, learning_rate=0.0005),
     "paper": YoloOptions(epochs=32, image_size=224, optimizer="SGD", learning_rate=0.01, turn=False),
     "drawings": YoloOptions(epochs=3, mosaic=False, turn=False),
 }
-"""``prim`` trains from drawings (set by hand), ``more`` continues on more sessions; ``paper``: IV-B, 32 epochs, batch
-32, SGD, learning rate 0.01; ``drawings`` is for detect.training.drawings, which vary enough without augmentation."""
+"""``prim`` trains from drawings (set by hand), ``more`` continues on more sessions, ``open`` on real
+places; ``paper``: IV-B, 32 epochs, batch 32, SGD, learning rate 0.01; ``drawings`` is for detect.training.drawings,
+which vary enough without augmentation."""
 
 
 def train_yolo(data: Path, mapper: str, output: Path, options: YoloOptions) -> Path:
@@ -507,7 +510,10 @@ def _trainer() -> type:
 
 @contextmanager
 def bfloat16_autocast() -> Iterator[None]:
-    """Let torch compute in bfloat16 where the processor has AMX: twice as fast, no less accurate."""
+    """Let torch compute in bfloat16 where the processor has AMX: twice as fast, no less accurate.
+
+    Nothing is kept of weights that were converted: the context holds a whole training, in which they change.
+    """
     supported = getattr(torch.cpu, "_is_amx_tile_supported", lambda: False)()
-    with torch.autocast("cpu", dtype=torch.bfloat16, enabled=bool(supported)):
+    with torch.autocast("cpu", dtype=torch.bfloat16, enabled=bool(supported), cache_enabled=False):
         yield
