@@ -661,7 +661,9 @@ class OtherOptions:
 
     prior: float = 1 / 6
     """Prior probability of «none of the kinds», as likely as each of the five, which share the rest evenly: where few
-    rays tell nothing, it decides."""
+    rays tell nothing, it decides; that of a log of many things is estimated from all of them."""
+    share_rounds: int = 30
+    """Rounds of expectation and maximisation in which it is."""
     min_difference: float = 0.025
     """A free outline that has more than 1 minus this in common with a kind (IoU) is that kind: real things are not
     exact."""

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import shapely
@@ -37,7 +37,8 @@ class Alternative:
 
     Attributes:
         vertices: (V, 2) its outline in m, map frame.
-        log_odds: Log Bayes factor against the likeliest kind (nats).
+        log_odds: Log Bayes factor against the likeliest kind (nats); of one that does not replace the kind the log
+            odds themselves, since it says nothing of how many things there are of no kind.
         std: Standard deviation (m) of the outline, across it; the median over its vertices.
         reason: What it is, in words and numbers.
         replaces_kind: Whether a candidate is reported as this where it is likelier than the kinds; else the kind is
@@ -156,8 +157,7 @@ def larger_alternatives(
     beside_other = any(are_flush(primitive, other, options.touching) for other in others)
     if beside_other or is_flush(primitive, candidate.cells, options.contact):
         reason = "one side is flush with what is beside it: as likely a part of that"
-        even = math.log(options.other.flush) - prior_log_odds(options.other)
-        found.append(Alternative(outline, even, std, reason, replaces_kind=False))
+        found.append(Alternative(outline, math.log(options.other.flush), std, reason, replaces_kind=False))
     return found
 
 
@@ -176,8 +176,32 @@ def other_log_odds(
     """
     if not alternatives:
         return -math.inf
-    together = float(np.logaddexp.reduce([one.log_odds for one in alternatives]))
-    return prior_log_odds(options) + together + math.log(max(likeliest_kind, 1 / len(Kind)))
+    prior = prior_log_odds(options)
+    together = float(np.logaddexp.reduce([one.log_odds + prior * one.replaces_kind for one in alternatives]))
+    return together + math.log(max(likeliest_kind, 1 / len(Kind)))
+
+
+def expected_share(log_odds: Sequence[float], options: OtherOptions = DEFAULTS.other) -> float:
+    """Estimate the share of things that are none of the kinds from all things of a log together.
+
+    In a building most things are none of the kinds, in a hall of pallets most are rectangles: the share is a
+    parameter of the log (empirical Bayes; Robbins 1956), with a Dirichlet prior of one count for each kind and one
+    for none of them, found by expectation and maximisation.
+
+    Args:
+        log_odds: Of each thing, the log posterior odds (nats) of «none of the kinds» under ``options.prior``.
+        options: The prior, and when the iteration ends.
+
+    Returns:
+        The share; about ``options.prior`` where there are few things.
+    """
+    factors = np.asarray(log_odds, float) - prior_log_odds(options)
+    counts = 1 / options.prior
+    share = options.prior
+    for _ in range(options.share_rounds):
+        odds = prior_log_odds(replace(options, prior=share)) + factors
+        share = (1 + float(np.exp(-np.logaddexp(0.0, -odds)).sum())) / (counts + len(factors))
+    return share
 
 
 def prior_log_odds(options: OtherOptions = DEFAULTS.other) -> float:

@@ -41,6 +41,7 @@ from detect.refinement.misfits import sensor_without_misfits
 from detect.refinement.options import DEFAULTS, AcceptanceOptions, OtherOptions, RefinementOptions
 from detect.refinement.other import (
     Alternative,
+    expected_share,
     free_alternatives,
     larger_alternatives,
     other_log_odds,
@@ -605,12 +606,8 @@ class Refinement:
         asked = [one for one in candidates if one.known is None and _may_be_something(results[id(one)], limits)]
         found = pool.map(lambda one: free_alternatives(one, one.fitted_rays, candidates, sensor), asked)
         shapes = {id(one): alternatives for one, alternatives in zip(asked, found, strict=True)}
-        beside = dict(results)
-        for key, alternatives in shapes.items():
-            beside[key] = _required(results[key]).beside(alternatives, other)
-        kept = {
-            id(one): _required(beside[id(one)]).primitive for one in candidates if _is_kept(beside[id(one)], limits)
-        }
+        beside = _all_beside(results, shapes, other)
+        kept = {key: _required(result).primitive for key, result in beside.items() if _is_kept(result, limits)}
         rest = [one for one in asked if id(one) in kept]
 
         def larger(one: Candidate) -> list[Alternative]:
@@ -620,8 +617,20 @@ class Refinement:
             return larger_alternatives(one, kept[id(one)], max(std["x"], std["y"]), others, sensor)
 
         for one, parts in zip(rest, pool.map(larger, rest), strict=True):
-            beside[id(one)] = _required(results[id(one)]).beside([*shapes[id(one)], *parts], other)
-        return beside
+            shapes[id(one)] += parts
+        return _all_beside(results, shapes, replace(other, prior=self._share_of_others(results, shapes)))
+
+    def _share_of_others(
+        self, results: Mapping[int, RefinedPrimitive | None], alternatives: Mapping[int, Sequence[Alternative]]
+    ) -> float:
+        """Estimate how many of the things that are reported, as a kind or as none, are none of the kinds."""
+        limits, other = self.options.acceptance, self.options.other
+        odds = []
+        for key, result in _all_beside(results, alternatives, other).items():
+            if result is not None and (result.is_other or _is_kept(result, limits)):
+                replacing = [one for one in alternatives.get(key, ()) if one.replaces_kind]
+                odds.append(other_log_odds(replacing, result.kind_probabilities[result.primitive.kind], other))
+        return expected_share(odds, other)
 
     def _parts_beside(self, candidate: Candidate) -> list[Candidate]:
         """Return the other parts of what a candidate was separated from."""
@@ -651,6 +660,18 @@ def _required(result: RefinedPrimitive | None) -> RefinedPrimitive:
     """Return a result that is known to be there."""
     assert result is not None
     return result
+
+
+def _all_beside(
+    results: Mapping[int, RefinedPrimitive | None],
+    alternatives: Mapping[int, Sequence[Alternative]],
+    options: OtherOptions,
+) -> dict[int, RefinedPrimitive | None]:
+    """Hold each result against its alternatives."""
+    return {
+        key: _required(result).beside(alternatives[key], options) if key in alternatives else result
+        for key, result in results.items()
+    }
 
 
 def _may_be_something(result: RefinedPrimitive | None, limits: AcceptanceOptions) -> bool:
