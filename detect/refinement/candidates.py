@@ -26,6 +26,7 @@ from detect.refinement.likelihood.sensor_model import (
     BeamModel,
     DistanceMap,
     background_log_likelihood,
+    occlusion_by,
     with_background,
 )
 from detect.refinement.options import DEFAULTS, RefinementOptions
@@ -79,6 +80,8 @@ class Candidate:
     current: Primitive = field(init=False)
     _cached: tuple[Background, tuple[float, float], FloatArray] | None = None
     _passed: dict[int, tuple[Candidate, bool]] = field(default_factory=dict)
+    _occluders: tuple[object, ...] = ()
+    _occlusion: FloatArray = field(default_factory=lambda: np.zeros(0))
 
     def __post_init__(self) -> None:
         self.current = self.start
@@ -108,13 +111,26 @@ class Candidate:
             self._cached = background, beams, background_log_likelihood(self.bundle, background, sensor)
         near = [other for other in others if other is not self and self._may_be_occluded_by(other)]
         shapes = [other.current for other in near if other.outline is None]
-        walls = [wall.stretch for wall in self.walls]
-        occlusion = [ranges_of(other.outline, self.bundle) for other in near if other.outline is not None]
+        outlines = [other.outline for other in near if other.outline is not None]
         errors = self.errors if errors is None else errors
         if errors != NO_ERRORS:
-            around = Surroundings(background, self._cached[2], shapes, walls, occlusion)
+            walls = [wall.stretch for wall in self.walls]
+            ranges = [ranges_of(outline, self.bundle) for outline in outlines]
+            around = Surroundings(background, self._cached[2], shapes, walls, ranges)
             return without_errors(self.bundle, around, shape or self.current, sensor, errors)
-        return with_background(self.bundle, background, self._cached[2], [*shapes, *walls], sensor, occlusion)
+        occlusion = self._occlusion_by(shapes, outlines)
+        return with_background(self.bundle, background, self._cached[2], occlusion, sensor)
+
+    def _occlusion_by(self, shapes: Sequence[Primitive], outlines: Sequence[FloatArray]) -> FloatArray:
+        """Return where its rays (N,) meet its walls and what stands near; again for as long as these are the same."""
+        things = (self.bundle, *shapes, *self.walls, *outlines)
+        if len(things) != len(self._occluders) or any(
+            a is not b for a, b in zip(things, self._occluders, strict=True)
+        ):
+            ranges = [ranges_of(outline, self.bundle) for outline in outlines]
+            self._occlusion = occlusion_by(self.bundle, [*shapes, *(wall.stretch for wall in self.walls)], ranges)
+            self._occluders = things
+        return self._occlusion
 
     def _may_be_occluded_by(self, other: Candidate) -> bool:
         """Tell whether some of its rays pass another candidate where that was first, or nearby; it is asked once."""

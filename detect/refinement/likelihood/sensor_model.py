@@ -192,13 +192,30 @@ def background_log_likelihood(bundle: RayBundle, background: Background, sensor:
     return np.asarray(np.log(likelihood))
 
 
+def occlusion_by(bundle: RayBundle, occluders: Sequence[Primitive], ranges: Sequence[FloatArray] = ()) -> FloatArray:
+    """Compute where rays meet the first of some things that may stand before a primitive or the background.
+
+    Args:
+        bundle: N rays.
+        occluders: Other primitives and walls.
+        ranges: Ranges (N,) in m to further things; FAR where a ray misses them.
+
+    Returns:
+        (N,) ranges in m; FAR where a ray meets none.
+    """
+    rays = bundle.rays.copy()
+    rays[OCCLUSION] = np.minimum.reduce(ranges, initial=FAR) if ranges else FAR
+    for other in occluders:
+        occlude(OUTLINES, NUMBERS[other.kind], parameters_of(other), other.bounding_radius, rays)
+    return np.asarray(rays[OCCLUSION])
+
+
 def with_background(
     bundle: RayBundle,
     background: Background,
     log_likelihood: FloatArray,
-    occluders: Sequence[Primitive],
+    occlusion: FloatArray,
     sensor: BeamModel,
-    occlusion: Sequence[FloatArray] = (),
 ) -> RayBundle:
     """Return rays with what they measure where they miss a primitive.
 
@@ -206,18 +223,14 @@ def with_background(
         bundle: N rays.
         background: What they meet in the map.
         log_likelihood: (N,) of :func:`background_log_likelihood`.
-        occluders: Other primitives and walls, which may stand before the primitive or the background.
+        occlusion: (N,) of :func:`occlusion_by`.
         sensor: The sensor.
-        occlusion: Ranges (N,) in m to further things that may stand there; FAR where a ray misses them.
 
     Returns:
         The rays, the rows OCCLUSION and BACKGROUND set.
     """
     rays = bundle.rays.copy()
-    rays[OCCLUSION] = np.minimum.reduce(occlusion, initial=FAR) if occlusion else FAR
-    rays[BACKGROUND] = log_likelihood
-    for other in occluders:
-        occlude(OUTLINES, NUMBERS[other.kind], parameters_of(other), other.bounding_radius, rays)
+    rays[OCCLUSION], rays[BACKGROUND] = occlusion, log_likelihood
     apply_occlusion(RayData(rays, bundle.outcomes, sensor.std, sensor.table), background.ranges, background.blocked)
     return bundle.with_rays(rays)
 

@@ -20,6 +20,7 @@ from detect.refinement.likelihood.sensor_model import (
     BeamModel,
     DistanceMap,
     background_log_likelihood,
+    occlusion_by,
     with_background,
 )
 from detect.refinement.options import DEFAULTS, ContactOptions
@@ -146,7 +147,8 @@ def _log_likelihood(
     """Return the log-likelihood (nats) of rays that meet nothing but the map and the occluders."""
     background = DistanceMap.of(occupied, cells.frame).background(bundle)
     likelihood = background_log_likelihood(bundle, background, sensor)
-    return float(with_background(bundle, background, likelihood, occluders, sensor).rays[BACKGROUND].sum())
+    occlusion = occlusion_by(bundle, occluders)
+    return float(with_background(bundle, background, likelihood, occlusion, sensor).rays[BACKGROUND].sum())
 
 
 def _explains(wall: Wall, primitive: Primitive, cells: MapCells, options: ContactOptions) -> bool:

@@ -22,6 +22,7 @@ from detect.refinement.likelihood.sensor_model import (
     BeamModel,
     DistanceMap,
     background_log_likelihood,
+    occlusion_by,
     with_background,
 )
 from detect.refinement.options import DEFAULTS
@@ -342,7 +343,7 @@ def test_background_is_that_of_the_map_and_of_occluders() -> None:
     occupied = cells.without(world.primitives, 0.02)
     background = DistanceMap.of(occupied, cells.frame).background(around)
     by_map = background_log_likelihood(around, background, sensor)
-    beams = with_background(around, background, by_map, [world.primitives[1]], sensor)
+    beams = with_background(around, background, by_map, occlusion_by(around, [world.primitives[1]]), sensor)
     exact = world.cast((0.0, 0.0), np.array([[1.0, 0.0]]))
     assert len(beams) and np.isfinite(beams.rays).all() and exact[0] > 0
     right = exact_costs(Kind.CIRCLE, parameters_of(world.primitives[0])[None], beams, sensor)[0]
