@@ -662,6 +662,12 @@ class OtherOptions:
     prior: float = 1 / 6
     """Prior probability of «none of the kinds», as likely as each of the five, which share the rest evenly: where few
     rays tell nothing, it decides; that of a log of many things is estimated from all of them."""
+    bagged_dispersion: float = 2.0
+    """Where scans disperse by more, a score is the mean of those by all rays and by parts of the scans; by hand."""
+    bagged_parts: int = 2
+    """Into how many parts; every so many-th scan makes one."""
+    bagged_doubt: float = 0.99
+    """What is more likely than this none of the kinds is not asked by parts."""
     share_rounds: int = 30
     """Rounds of expectation and maximisation in which it is."""
     min_difference: float = 0.025

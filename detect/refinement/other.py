@@ -181,6 +181,22 @@ def other_log_odds(
     return together + math.log(max(likeliest_kind, 1 / len(Kind)))
 
 
+def other_probability(
+    alternatives: Sequence[Alternative], likeliest_kind: float, options: OtherOptions = DEFAULTS.other
+) -> float:
+    """Return the posterior probability of «none of the kinds».
+
+    Args:
+        alternatives: The hypotheses, each with its odds against the likeliest kind.
+        likeliest_kind: Posterior probability of that kind among the kinds.
+        options: The prior.
+
+    Returns:
+        0 to 1; 0 where there is no alternative.
+    """
+    return float(np.exp(-np.logaddexp(0.0, -other_log_odds(alternatives, likeliest_kind, options))))
+
+
 def expected_share(log_odds: Sequence[float], options: OtherOptions = DEFAULTS.other) -> float:
     """Estimate the share of things that are none of the kinds from all things of a log together.
 

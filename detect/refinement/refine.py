@@ -30,6 +30,7 @@ from detect.detection import (
     UnknownObject,
     no_progress,
 )
+from detect.refinement.bagging import PartialPosterior, partial_posteriors
 from detect.refinement.candidates import Candidate, by_level, find_backgrounds, fit_candidates
 from detect.refinement.fitting.evidence import compare_kinds
 from detect.refinement.likelihood.geometry import parameters_of, ranges_to
@@ -45,6 +46,7 @@ from detect.refinement.other import (
     free_alternatives,
     larger_alternatives,
     other_log_odds,
+    other_probability,
     simple_outline,
 )
 from detect.refinement.scanner_errors import correct_scanner_errors, settle_scanner_errors, with_shared_errors
@@ -120,9 +122,27 @@ class RefinedPrimitive:
         if not alternatives:
             return self
         likeliest = self.kind_probabilities[self.primitive.kind]
-        probability = float(np.exp(-np.logaddexp(0.0, -other_log_odds(alternatives, likeliest, options))))
+        probability = other_probability(alternatives, likeliest, options)
         best = max(alternatives, key=lambda one: one.log_odds)
         return replace(self, other_probability=probability, alternative=best)
+
+    def averaged(self, parts: Sequence[PartialPosterior]) -> RefinedPrimitive:
+        """Average the posterior with those by parts of the scans.
+
+        Args:
+            parts: The posteriors by these.
+
+        Returns:
+            The result with the mean probabilities; its shape stays.
+        """
+        posteriors = [PartialPosterior(self.kind_probabilities, self.other_probability), *parts]
+        other = float(np.mean([one.other_probability for one in posteriors]))
+        together = {
+            kind: float(np.mean([(1 - one.other_probability) * one.kind_probabilities[kind] for one in posteriors]))
+            for kind in self.kind_probabilities
+        }
+        given = {kind: share / (1 - other) if other < 1 else 0.0 for kind, share in together.items()}
+        return replace(self, other_probability=other, kind_probabilities=given)
 
 
 @dataclass(frozen=True)
@@ -616,9 +636,17 @@ class Refinement:
             std = _required(results[id(one)]).std
             return larger_alternatives(one, kept[id(one)], max(std["x"], std["y"]), others, sensor)
 
-        for one, parts in zip(rest, pool.map(larger, rest), strict=True):
-            shapes[id(one)] += parts
-        return _all_beside(results, shapes, replace(other, prior=self._share_of_others(results, shapes)))
+        parts = dict(zip(map(id, rest), pool.map(larger, rest), strict=True))
+        alternatives = {key: [*found, *parts.get(key, ())] for key, found in shapes.items()}
+        other = replace(other, prior=self._share_of_others(results, alternatives))
+        beside = _all_beside(results, alternatives, other)
+        if sensor.dispersion <= other.bagged_dispersion:
+            return beside
+        doubtful = [one for one in asked if _required(beside[id(one)]).other_probability < other.bagged_doubt]
+        work = ((one, candidates, parts.get(id(one), ()), sensor, other) for one in doubtful)
+        for one, posteriors in zip(doubtful, pool.map(lambda item: partial_posteriors(*item), work), strict=True):
+            beside[id(one)] = _required(beside[id(one)]).averaged(posteriors)
+        return beside
 
     def _share_of_others(
         self, results: Mapping[int, RefinedPrimitive | None], alternatives: Mapping[int, Sequence[Alternative]]
