@@ -23,11 +23,14 @@ class PyramidOptions:
         seen_cells: Things of up to so many cells across are searched for at a level; those that are larger at the
             next, in cells twice as large. The paper's largest square, 0.32 m in cells of 1 cm, is 45 across.
         fewest_cells: Things that are seen in fewer cells have no shape; set by hand.
+        enough_cells: Cells are not twice as large where the smallest wanted things were seen in fewer: networks
+            localise those well that are seen in so many; set by hand.
         rounding: Relative rounding errors of resolutions.
     """
 
     seen_cells: float = 48.0
     fewest_cells: float = 5.0
+    enough_cells: float = 16.0
     rounding: float = 1e-6
 
 
@@ -64,7 +67,7 @@ def levels_for(
     """
     smallest, largest = sizes
     factor = 1
-    while 2 * factor * resolution * options.fewest_cells <= smallest * (1 + options.rounding):
+    while 2 * factor * resolution * options.enough_cells <= smallest * (1 + options.rounding):
         factor *= 2
     widest, lower = largest * np.sqrt(2), 0.0
     levels: list[PyramidLevel] = []

@@ -60,10 +60,10 @@ def test_levels_cover_all_sizes_without_a_gap(resolution: float, smallest: float
     assert levels[-1].extents[1] >= math.sqrt(2) * sizes[1] * (1 - 1e-6)
     for one, following in pairwise(levels):
         assert one.extents[1] == following.extents[0] and following.factor == 2 * one.factor
-    assert levels[0].factor == 1 or 5 * levels[0].resolution <= smallest * (1 + 1e-6)
+    assert levels[0].factor == 1 or 16 * levels[0].resolution <= smallest * (1 + 1e-6)
 
 
 def test_what_is_searched_for_by_default() -> None:
     assert [level.factor for level in levels_for(0.01, DEFAULT_SIZES)] == [1, 2, 4, 8]
     assert [level.factor for level in levels_for(0.05, DEFAULT_SIZES)] == [1, 2]
-    assert [level.factor for level in levels_for(0.01, (0.5, 2.0))] == [8]
+    assert [level.factor for level in levels_for(0.01, (0.5, 2.0))] == [2, 4, 8]
