@@ -31,9 +31,9 @@ class RayOptions:
 
     max_rays: int = 8000
     """Rays of one candidate; of more than twice as many every other scan is left out. Bounds the time."""
-    max_total: int = 100_000
+    max_total: int = 200_000
     """Rays of all candidates together, about, as long as each has …"""
-    min_rays: int = 1000
+    min_rays: int = 2000
     """… so many."""
     max_range: float = 1000.0
     """m; a sensor whose range_max is larger, or infinite, is taken to reach so far."""

@@ -540,7 +540,7 @@ class Refinement:
         dropouts = estimate_dropouts(seen, noise, options.sensor)
         sensor = BeamModel.create(noise, span, max_std=max_noise, options=options.sensor, dropout_share=dropouts)
         fit_candidates(pool, seen, [True] * len(seen), sensor)
-        single = self._near_rays(self._without_hopeless(pool, seen, preferred, sensor))
+        single = self._near_rays(without_duplicates(seen, preferred, sensor))
         if not single:
             return {}
         done = _Done(self.progress, len(single))
@@ -549,6 +549,9 @@ class Refinement:
         dropouts = estimate_dropouts(single, noise, options.sensor)
         sensor = BeamModel.create(noise, span, max_std=max_noise, options=options.sensor, dropout_share=dropouts)
         self._fit_jointly(pool, single, sensor)
+        single = self._without_hopeless(pool, single, preferred, sensor)
+        if not single:
+            return {}
         single, sensor = self._find_sensor(pool, sites, single, sensor)
         done.reach(ESTIMATED)
         disperses = sensor.dispersion > options.sensor.significant_dispersion
@@ -568,19 +571,18 @@ class Refinement:
         return results
 
     def _without_hopeless(
-        self, pool: Executor, seen: list[Candidate], preferred: list[Candidate], sensor: BeamModel
+        self, pool: Executor, candidates: list[Candidate], preferred: list[Candidate], sensor: BeamModel
     ) -> list[Candidate]:
-        """Remove duplicates, and what the rays speak against; what that hid is fitted again before it is judged."""
-        hopeless = self.options.acceptance.hopeless
-        single = without_duplicates(seen, preferred, sensor)
-        against = {id(one) for one in single if log_ratio_of(one, single, sensor) < hopeless}
-        sure = {id(one) for one in preferred}
-        if not against - sure:
-            return single
-        left = [one for one in single if id(one) not in against or id(one) in sure]
-        find_backgrounds(pool, left, is_first=True)
-        fit_candidates(pool, left, [id(one) in against for one in left], sensor)
-        return [one for one in left if id(one) not in against or log_ratio_of(one, left, sensor) > hopeless]
+        """Remove what the rays speak against; what that hid is fitted again.
+
+        They are judged after the joint fit: before it, what stands beside another thing may be far from its own.
+        """
+        hopeless, sure = self.options.acceptance.hopeless, {id(one) for one in preferred}
+        ratios = [log_ratio_of(one, candidates, sensor) for one in candidates]
+        left = [one for one, nats in zip(candidates, ratios, strict=True) if nats > hopeless or id(one) in sure]
+        if left and len(left) < len(candidates):
+            fit_candidates(pool, left, find_backgrounds(pool, left), sensor)
+        return left
 
     def _find_sensor(
         self, pool: Executor, sites: Sequence[Site], candidates: list[Candidate], sensor: BeamModel
