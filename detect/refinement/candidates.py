@@ -154,9 +154,9 @@ class Candidate:
         return self.fitted_to[1]
 
     def holds_laser(self) -> bool:
-        """Tell whether some ray begins in what it was taken for: that is then a room, or a part of one."""
+        """Tell whether more than a few scans begin in what it is taken for: that is a room, or a part of one."""
         origins = np.unique(self.bundle.rays[[ORIGIN_X, ORIGIN_Y]], axis=1).T
-        return bool(is_within(self.start, origins, 0.0).any())
+        return bool(is_within(self.current, origins, 0.0).mean() > self.options.rays.room_share)
 
     def surface_ranges(self, bundle: RayBundle) -> FloatArray:
         """Return the ranges (N,) in m at which rays meet its free outline, else the primitive; FAR for a miss."""

@@ -37,6 +37,9 @@ class RayOptions:
     """… so many."""
     max_range: float = 1000.0
     """m; a sensor whose range_max is larger, or infinite, is taken to reach so far."""
+    room_share: float = 0.05
+    """What more of its scans than this share begin in is a room; a guess that is too large, or a scanner that brushes
+    past, has few of them."""
     reach: float = scaled(0.07)
     """m; rays that pass a candidate at this distance are collected."""
     fitted_reach: float = scaled(0.03)

@@ -580,6 +580,7 @@ class Refinement:
         hopeless, sure = self.options.acceptance.hopeless, {id(one) for one in preferred}
         ratios = [log_ratio_of(one, candidates, sensor) for one in candidates]
         left = [one for one, nats in zip(candidates, ratios, strict=True) if nats > hopeless or id(one) in sure]
+        left = [one for one in left if not one.holds_laser()]
         if left and len(left) < len(candidates):
             fit_candidates(pool, left, find_backgrounds(pool, left), sensor)
         return left
