@@ -12,6 +12,7 @@ from mapping.mapper import MAPPERS
 from prim import console
 from prim.arrays import FloatArray
 from prim.se2 import Pose2D
+from prim.shapes import Kind
 from replay.cli import app
 from replay.options import ReplayOptions
 from replay.pipeline import Pipeline
@@ -80,6 +81,17 @@ def test_the_floor_plan_of_csail(real_log: Find, mapper: str) -> None:
         row, col = (np.array([y - y0, x - x0]) / 0.05).astype(int)
         assert grid.free[row - 1 : row + 2, col - 1 : col + 2].mean() > 0.5
     assert 3_000 < np.count_nonzero(grid.occupied) < 30_000
+
+
+def test_the_two_boxes_of_csail_are_rectangles(real_log: Find) -> None:
+    """They are alike, and stand free in a room of their own."""
+    result = Pipeline(real_log("csail.mcap"), ReplayOptions(mapper="prob", resolution=0.05)).run()
+    assert result.detections is not None
+    found = [detection.primitive for detection in result.detections.detections.found]
+    for x, y in ((30.56, -17.39), (30.16, -18.22)):
+        (box,) = (one for one in found if math.hypot(one.x - x, one.y - y) < 0.1)
+        assert box.kind is Kind.RECTANGLE
+        assert box.size == pytest.approx((0.56, 0.42), abs=0.03)
 
 
 def test_odometry_and_transforms_of_csail_agree(real_log: Find) -> None:

@@ -10,8 +10,10 @@ from detect.refinement.candidates import Candidate, fit_candidates
 from detect.refinement.likelihood.rays import collect_rays
 from detect.refinement.likelihood.sensor_model import BeamModel, DistanceMap
 from detect.refinement.options import DEFAULTS
-from detect.refinement.refine import RefinedPrimitive
+from detect.refinement.refine import RefinedPrimitive, Refinement
+from detect.refinement.surroundings.levels import MapLevels
 from detect.refinement.surroundings.map_cells import MapCells
+from prim.se2 import Pose2D
 from prim.shapes import Kind
 from tests.detect.refinement.rooms import mapped, room, scans, shape
 
@@ -53,3 +55,18 @@ def test_parts_of_the_scans_of_a_square_are_sure_that_it_is_one() -> None:
     one_scan = bundle.scan == bundle.scan[0]
     candidate.keep_rays(one_scan)
     assert partial_posteriors(candidate, [candidate], [], sensor, DEFAULTS.other) == []
+
+
+@pytest.mark.parametrize(("pose_std", "asked"), [(0.0, False), (0.02, True)])
+def test_parts_are_asked_where_poses_are_off(monkeypatch: pytest.MonkeyPatch, pose_std: float, asked: bool) -> None:
+    """A range noise of 5 mm, poses off by 20 mm: then a score is the mean of three."""
+    rng = np.random.default_rng(1)
+    taken = [
+        (scan, Pose2D(pose.x + rng.normal(0, pose_std), pose.y + rng.normal(0, pose_std), pose.theta))
+        for scan, pose in scans(room(shape(Kind.SQUARE)), 0.005)
+    ]
+    parts = [PartialPosterior(EVEN, 0.0)] * 2
+    monkeypatch.setattr("detect.refinement.refine.partial_posteriors", lambda *_: parts)
+    (found,) = Refinement(MapLevels.of(mapped(taken)), noise_std=0.005).run([shape(Kind.SQUARE)], taken)
+    assert found is not None
+    assert found.score <= (1 + 0.2 + 0.2) / 3 if asked else found.score > 0.95

@@ -8,6 +8,10 @@ import pytest
 
 from detect.refinement.options import DEFAULTS
 from detect.refinement.other import Alternative, expected_share, other_log_odds
+from detect.refinement.refine import Refinement
+from detect.refinement.surroundings.levels import MapLevels
+from prim.shapes import Kind
+from tests.detect.refinement.rooms import mapped, room, scans, shape
 
 OPTIONS = DEFAULTS.other
 LOGIT = math.log(OPTIONS.prior / (1 - OPTIONS.prior))
@@ -40,3 +44,16 @@ def test_what_is_flush_is_even_whatever_the_prior() -> None:
     flush = Alternative(np.zeros((3, 2)), 0.0, 0.01, "flush", replaces_kind=False)
     for prior in (0.05, 1 / 6, 0.9):
         assert other_log_odds([flush], 1.0, replace(OPTIONS, prior=prior)) == pytest.approx(0.0)
+
+
+def test_the_share_of_a_log_is_the_prior_of_its_things(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The same rays, in a log where nearly everything is of no kind: the doubt grows by the odds of the share."""
+    taken = scans(room(shape(Kind.SQUARE), shape(Kind.CIRCLE, 0.5, 0.5)), 0.2)
+    levels, guesses = MapLevels.of(mapped(taken)), [shape(Kind.SQUARE), shape(Kind.CIRCLE, 0.5, 0.5)]
+    doubts = []
+    for share in (0.01, 0.99):
+        monkeypatch.setattr("detect.refinement.refine.expected_share", lambda *_, share=share: share)
+        found = Refinement(levels).run(guesses, taken)
+        doubts.append([one.other_probability for one in found if one is not None])
+    few, many = (np.log(np.array(doubt) / (1 - np.array(doubt))) for doubt in doubts)
+    assert many - few == pytest.approx(2 * math.log(99), abs=0.01)
