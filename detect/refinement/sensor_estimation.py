@@ -26,7 +26,7 @@ from detect.refinement.likelihood.kernels import (
 from detect.refinement.likelihood.rays import RayBundle
 from detect.refinement.likelihood.sensor_model import BeamModel, table_nearest
 from detect.refinement.options import DEFAULTS, SensorOptions
-from detect.refinement.outlines.kernels import outline_likelihood
+from detect.refinement.outlines.kernels import NO_INFORMATION, outline_likelihood
 from prim import linear_algebra
 from prim.arrays import FloatArray
 from prim.normal import NORMAL_MAD
@@ -240,42 +240,50 @@ def _scan_scores(candidate: Candidate, bundle: RayBundle, sensor: BeamModel) -> 
     """
     blur = max(sensor.footprint, sensor.options.min_score_blur)
     outline = candidate.outline
-    score_of = _score_by_parameters(candidate.fits[0]) if outline is None else _score_by_place(outline)
-    lower = linear_algebra.cholesky(score_of(sensor.data(bundle), blur)[1])
+    by_own = _ScoreByParameters(candidate.fits[0]) if outline is None else _ScoreByPlace(outline)
+    lower = linear_algebra.cholesky(by_own.information(sensor.data(bundle), blur))
     whiten = None if lower is None else linear_algebra.inverse(lower)
     if whiten is None:
         return None
     scans, number = np.unique(bundle.scan, return_inverse=True)
     parts = (bundle.select(number == k) for k in range(len(scans)))
-    return np.array([whiten @ score_of(sensor.data(part), blur)[0] for part in parts])
+    return np.array([by_own.score(sensor.data(part), blur) for part in parts]) @ whiten.T
 
 
-Score = Callable[[RayData, float], tuple[FloatArray, FloatArray]]
-"""A function of rays and a blur (m): score (K,) and information (K, K)."""
+class _ScoreByParameters:
+    """The score of rays by a kind's own parameters (K,), and the information (K, K)."""
 
+    def __init__(self, fit: KindFit) -> None:
+        self._fit, self._jacobian = fit, JACOBIANS[fit.kind]
 
-def _score_by_parameters(fit: KindFit) -> Score:
-    """Return the score of rays by a kind's own parameters."""
-    jacobian = JACOBIANS[fit.kind]
+    def score(self, data: RayData, blur: float) -> FloatArray:
+        return np.asarray(self._jacobian.T @ self._evaluated(data, blur)[0])
 
-    def score(data: RayData, blur: float) -> tuple[FloatArray, FloatArray]:
+    def information(self, data: RayData, blur: float) -> FloatArray:
+        return np.asarray(self._jacobian.T @ self._evaluated(data, blur)[1] @ self._jacobian)
+
+    def _evaluated(self, data: RayData, blur: float) -> tuple[FloatArray, FloatArray]:
         slope, information = np.zeros(PARAMETERS), np.zeros((PARAMETERS, PARAMETERS))
-        gradient(OUTLINES, NUMBERS[fit.kind], fit.p, data, blur, slope, information)
-        return jacobian.T @ slope, jacobian.T @ information @ jacobian
-
-    return score
+        gradient(OUTLINES, NUMBERS[self._fit.kind], self._fit.p, data, blur, slope, information)
+        return slope, information
 
 
-def _score_by_place(outline: FloatArray) -> Score:
-    """Return the score of rays by the place of an outline (V, 2): the sum of those by its vertices."""
+class _ScoreByPlace:
+    """The score of rays by the place (2,) of an outline (V, 2), the sum of those by its vertices; the information."""
 
-    def score(data: RayData, blur: float) -> tuple[FloatArray, FloatArray]:
-        slope, information = np.zeros(outline.size), np.zeros((outline.size, outline.size))
-        outline_likelihood(outline, data, blur, slope, information)
-        count = len(outline)
-        return slope.reshape(count, 2).sum(axis=0), information.reshape(count, 2, count, 2).sum(axis=(0, 2))
+    def __init__(self, outline: FloatArray) -> None:
+        self._outline = outline
 
-    return score
+    def score(self, data: RayData, blur: float) -> FloatArray:
+        slope = np.zeros(self._outline.size)
+        outline_likelihood(self._outline, data, blur, slope, NO_INFORMATION)
+        return np.asarray(slope.reshape(-1, 2).sum(axis=0))
+
+    def information(self, data: RayData, blur: float) -> FloatArray:
+        size, count = self._outline.size, len(self._outline)
+        information = np.zeros((size, size))
+        outline_likelihood(self._outline, data, blur, np.zeros(size), information)
+        return np.asarray(information.reshape(count, 2, count, 2).sum(axis=(0, 2)))
 
 
 def _without_truncation(error: FloatArray, cut: FloatArray) -> FloatArray:

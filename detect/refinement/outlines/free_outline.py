@@ -16,13 +16,16 @@ import numpy as np
 from detect.refinement.likelihood.rays import RayBundle
 from detect.refinement.likelihood.sensor_model import BeamModel
 from detect.refinement.options import DEFAULTS, OutlineOptions
-from detect.refinement.outlines.kernels import outline_likelihood, outline_ranges, project_on_harmonics
+from detect.refinement.outlines.kernels import (
+    NO_GRADIENT,
+    NO_INFORMATION,
+    outline_likelihood,
+    outline_ranges,
+    project_on_harmonics,
+)
 from prim import linear_algebra
 from prim.arrays import FloatArray
 from prim.shapes import Primitive
-
-NO_GRADIENT = np.zeros(0)
-NO_INFORMATION = np.zeros((0, 0))
 
 
 def ranges_of(vertices: FloatArray, bundle: RayBundle) -> FloatArray:

@@ -41,6 +41,10 @@ SCRATCH_ROWS = 11
 LEAST_INCIDENCE = 0.05
 """The least cosine between a ray and an edge's normal that the range's slope reckons with."""
 
+NO_GRADIENT = np.zeros(0)
+NO_INFORMATION = np.zeros((0, 0))
+"""Stand for derivatives that are not wanted."""
+
 
 @part
 def _lookup(table: Any, row: int, x: float) -> float:
@@ -139,13 +143,14 @@ def outline_likelihood(  # noqa: C901 - one pass over the rays
         blur: Half-width (m) of the smooth step at silhouettes.
         gradient: (2 V,) gets the gradient by the vertices' coordinates; where it is empty, it and the information are
             not computed.
-        information: (2 V, 2 V) gets the information (Gauss and Newton's, the squared score at silhouettes).
+        information: (2 V, 2 V) gets the information (Gauss and Newton's, the squared score at silhouettes); where it
+            is empty, it is not computed.
 
     Returns:
         The cost (nats).
     """
     rays, outcomes, sigma, table = data
-    wanted = len(gradient) > 0
+    wanted, informs = len(gradient) > 0, len(information) > 0
     scratch = np.empty((SCRATCH_ROWS, BLOCK))
     index, slope = np.empty(4, np.int64), np.empty(4)
     gradient[:] = 0.0
@@ -207,16 +212,17 @@ def outline_likelihood(  # noqa: C901 - one pass over the rays
                 slope[2], slope[3] = nx * share, ny * share
             for a in range(used):
                 gradient[index[a]] -= score * slope[a]
-                for b in range(used):
+                for b in range(used if informs else 0):
                     information[index[a], index[b]] += weight * slope[a] * slope[b]
             if step != 0.0:
                 by_x, by_y = -side * dy * step, side * dx * step
                 gradient[2 * corner] -= by_x
                 gradient[2 * corner + 1] -= by_y
-                information[2 * corner, 2 * corner] += by_x * by_x
-                information[2 * corner, 2 * corner + 1] += by_x * by_y
-                information[2 * corner + 1, 2 * corner] += by_x * by_y
-                information[2 * corner + 1, 2 * corner + 1] += by_y * by_y
+                if informs:
+                    information[2 * corner, 2 * corner] += by_x * by_x
+                    information[2 * corner, 2 * corner + 1] += by_x * by_y
+                    information[2 * corner + 1, 2 * corner] += by_x * by_y
+                    information[2 * corner + 1, 2 * corner + 1] += by_y * by_y
     return -total
 
 

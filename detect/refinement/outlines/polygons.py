@@ -17,16 +17,13 @@ from detect.refinement.likelihood.kernels import RayData
 from detect.refinement.likelihood.rays import RayBundle
 from detect.refinement.likelihood.sensor_model import BeamModel
 from detect.refinement.options import DEFAULTS, Descent, PolygonOptions
-from detect.refinement.outlines.kernels import outline_likelihood
+from detect.refinement.outlines.kernels import NO_GRADIENT, NO_INFORMATION, outline_likelihood
 from detect.refinement.surroundings.map_cells import MapCells, is_within
 from detect.refinement.surroundings.walls import Wall
 from mapping.morphology import component_around, outer_contour
 from prim import linear_algebra
 from prim.arrays import FloatArray
 from prim.shapes import Primitive
-
-NO_GRADIENT = np.zeros(0)
-NO_INFORMATION = np.zeros((0, 0))
 
 
 @dataclass(frozen=True)

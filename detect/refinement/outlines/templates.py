@@ -19,14 +19,11 @@ from detect.refinement.likelihood.kernels import RayData
 from detect.refinement.likelihood.rays import RayBundle
 from detect.refinement.likelihood.sensor_model import BeamModel
 from detect.refinement.options import DEFAULTS, Descent, EvidenceOptions, TemplateOptions
-from detect.refinement.outlines.kernels import outline_likelihood
+from detect.refinement.outlines.kernels import NO_GRADIENT, NO_INFORMATION, outline_likelihood
 from detect.refinement.outlines.polygons import std_across
 from prim import linear_algebra
 from prim.arrays import FloatArray
 from prim.shapes import Kind, Primitive
-
-NO_GRADIENT = np.zeros(0)
-NO_INFORMATION = np.zeros((0, 0))
 
 POSE = 3
 """Parameters before the sizes: x, y (m), theta (rad)."""
