@@ -37,6 +37,8 @@ from detect.refinement.wall_surfaces import measure_walls, sharpen
 from prim.arrays import BoolGrid, FloatArray
 from prim.shapes import Primitive
 
+NOTHING = np.zeros(0)
+
 
 @dataclass
 class Candidate:
@@ -80,8 +82,7 @@ class Candidate:
     current: Primitive = field(init=False)
     _cached: tuple[Background, tuple[float, float], FloatArray] | None = None
     _passed: dict[int, tuple[Candidate, bool]] = field(default_factory=dict)
-    _occluders: tuple[object, ...] = ()
-    _occlusion: FloatArray = field(default_factory=lambda: np.zeros(0))
+    _occlusion: tuple[tuple[object, ...], float, tuple[FloatArray, FloatArray]] = (), 0.0, (NOTHING, NOTHING)
 
     def __post_init__(self) -> None:
         self.current = self.start
@@ -110,27 +111,29 @@ class Candidate:
         if self._cached is None or self._cached[0] is not background or self._cached[1] != beams:
             self._cached = background, beams, background_log_likelihood(self.bundle, background, sensor)
         near = [other for other in others if other is not self and self._may_be_occluded_by(other)]
-        shapes = [other.current for other in near if other.outline is None]
-        outlines = [other.outline for other in near if other.outline is not None]
         errors = self.errors if errors is None else errors
+        walls, nearest = self._occlusion_by(near, errors.reach)
         if errors != NO_ERRORS:
-            walls = [wall.stretch for wall in self.walls]
-            ranges = [ranges_of(outline, self.bundle) for outline in outlines]
-            around = Surroundings(background, self._cached[2], shapes, walls, ranges)
+            around = Surroundings(background, self._cached[2], walls, nearest)
             return without_errors(self.bundle, around, shape or self.current, sensor, errors)
-        occlusion = self._occlusion_by(shapes, outlines)
-        return with_background(self.bundle, background, self._cached[2], occlusion, sensor)
+        return with_background(self.bundle, background, self._cached[2], np.minimum(walls, nearest), sensor)
 
-    def _occlusion_by(self, shapes: Sequence[Primitive], outlines: Sequence[FloatArray]) -> FloatArray:
-        """Return where its rays (N,) meet its walls and what stands near; again for as long as these are the same."""
+    def _occlusion_by(self, others: Sequence[Candidate], reach: float) -> tuple[FloatArray, FloatArray]:
+        """Return where its rays (N,) meet its walls, and others; again for as long as these are the same."""
+        shapes = [other.current for other in others if other.outline is None]
+        outlines = [other.outline for other in others if other.outline is not None]
         things = (self.bundle, *shapes, *self.walls, *outlines)
-        if len(things) != len(self._occluders) or any(
-            a is not b for a, b in zip(things, self._occluders, strict=True)
+        earlier, at, ranges = self._occlusion
+        if (
+            at != reach
+            or len(things) != len(earlier)
+            or any(a is not b for a, b in zip(things, earlier, strict=True))
         ):
-            ranges = [ranges_of(outline, self.bundle) for outline in outlines]
-            self._occlusion = occlusion_by(self.bundle, [*shapes, *(wall.stretch for wall in self.walls)], ranges)
-            self._occluders = things
-        return self._occlusion
+            walls = occlusion_by(self.bundle, [wall.stretch for wall in self.walls], reach)
+            nearest = occlusion_by(self.bundle, shapes, reach)
+            ranges = walls, np.minimum.reduce([nearest, *(ranges_of(outline, self.bundle) for outline in outlines)])
+            self._occlusion = things, reach, ranges
+        return ranges
 
     def _may_be_occluded_by(self, other: Candidate) -> bool:
         """Tell whether some of its rays pass another candidate where that was first, or nearby; it is asked once."""

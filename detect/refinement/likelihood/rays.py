@@ -13,6 +13,8 @@ from detect.refinement.likelihood.geometry import passes_within
 from detect.refinement.likelihood.kernels import (
     BACKGROUND,
     COLLECTED_ROWS,
+    DIRECTION_X,
+    DIRECTION_Y,
     ENTRY_RANGE,
     FAR,
     OCCLUSION,
@@ -23,7 +25,7 @@ from detect.refinement.options import DEFAULTS, RefinementOptions
 from mapping.range_noise import neighbour_noise
 from prim.arrays import FloatArray, Stamps
 from prim.scan import RangeOutcome, Scan
-from prim.se2 import Pose2D
+from prim.se2 import Pose2D, rotate
 from prim.shapes import Primitive
 
 FIRST_ROOM = 1024
@@ -95,6 +97,21 @@ class RayBundle:
             self.max_range[chosen],
             self.scan[chosen],
         )
+
+
+def turned_rays(rays: FloatArray, turn: float) -> FloatArray:
+    """Turn rays about their origins.
+
+    Args:
+        rays: (7, N).
+        turn: The angle (rad).
+
+    Returns:
+        (7, N).
+    """
+    turned = rays.copy()
+    turned[DIRECTION_X : DIRECTION_Y + 1] = rotate(rays[DIRECTION_X : DIRECTION_Y + 1].T, turn).T
+    return turned
 
 
 class RayBuffer:

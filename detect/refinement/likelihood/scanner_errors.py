@@ -31,13 +31,11 @@ from detect.refinement.likelihood.kernels import (
     RayData,
     apply_occlusion,
     cast_rays,
-    occlude,
     silhouette_clearances,
 )
-from detect.refinement.likelihood.rays import RayBundle
+from detect.refinement.likelihood.rays import RayBundle, turned_rays
 from detect.refinement.likelihood.sensor_model import Background, BeamModel
 from prim.arrays import FloatArray
-from prim.se2 import rotate
 from prim.shapes import Primitive
 
 
@@ -68,16 +66,14 @@ class Surroundings:
     Attributes:
         background: What they meet in the map.
         log_likelihood: (N,) of the measurements by it (nats).
-        primitives: Other candidates, where they are.
-        walls: Walls, where the map has them.
-        occlusion: Ranges (N,) in m to further surfaces; FAR for none.
+        walls: Ranges (N,) in m to the map's walls, of :func:`detect.refinement.likelihood.sensor_model.occlusion_by`.
+        others: Ranges (N,) in m to further things, such as other candidates.
     """
 
     background: Background
     log_likelihood: FloatArray
-    primitives: Sequence[Primitive]
-    walls: Sequence[Primitive]
-    occlusion: Sequence[FloatArray] = ()
+    walls: FloatArray
+    others: FloatArray
 
 
 def without_errors(
@@ -87,7 +83,7 @@ def without_errors(
 
     Args:
         bundle: N rays as they were measured.
-        around: What else they may meet.
+        around: What else they may meet, by beams of the width that ``errors`` has.
         shape: The primitive as it was last fitted.
         sensor: The sensor.
         errors: The scanner's errors.
@@ -96,11 +92,10 @@ def without_errors(
         The rays: ranges and limits without the bias, directions turned to the nearest surface, the rows OCCLUSION and
         BACKGROUND set. Mixed pixels are occluded: they have no part in the likelihood.
     """
-    rays, turns = bundle.rays.copy(), (-errors.reach, 0.0, errors.reach) if errors.reach else (0.0,)
+    rays = bundle.rays.copy()
     rays[RANGE] -= errors.range_bias
     rays[BACKGROUND] = around.log_likelihood
-    walls = _occlusion(rays, around.walls, turns) - errors.range_bias
-    rays[OCCLUSION] = np.minimum.reduce([walls, _occlusion(rays, around.primitives, turns), *around.occlusion])
+    rays[OCCLUSION] = np.minimum(around.walls - errors.range_bias, around.others)
     behind = around.background.ranges - errors.range_bias
     apply_occlusion(RayData(rays, bundle.outcomes, sensor.std, sensor.table), behind, around.background.blocked)
     if errors.mixed:
@@ -111,25 +106,6 @@ def without_errors(
     return bundle.with_rays(rays)
 
 
-def _occlusion(rays: FloatArray, occluders: Sequence[Primitive], turns: Sequence[float]) -> FloatArray:
-    """Return where (N,) the nearest of rays turned by some angles (rad) meets some shapes (m); FAR for none."""
-    nearest = np.full(rays.shape[1], FAR)
-    for turn in turns if occluders else ():
-        turned = _turned(rays, turn)
-        turned[OCCLUSION] = FAR
-        for other in occluders:
-            occlude(OUTLINES, NUMBERS[other.kind], parameters_of(other), other.bounding_radius, turned)
-        nearest = np.minimum(nearest, turned[OCCLUSION])
-    return nearest
-
-
-def _turned(rays: FloatArray, turn: float) -> FloatArray:
-    """Return rays (7, N) with their directions turned (rad)."""
-    turned = rays.copy()
-    turned[DIRECTION_X : DIRECTION_Y + 1] = rotate(rays[DIRECTION_X : DIRECTION_Y + 1].T, turn).T
-    return turned
-
-
 def _turn_to_nearest(rays: FloatArray, shape: Primitive, turns: Sequence[float]) -> None:
     """Turn rays (7, N) to where a shape is nearest, by one of some angles (rad).
 
@@ -137,7 +113,7 @@ def _turn_to_nearest(rays: FloatArray, shape: Primitive, turns: Sequence[float])
     the measured range is raised by what the shape is further away there than where it is nearest.
     """
     number, p, every = NUMBERS[shape.kind], parameters_of(shape), np.arange(rays.shape[1])
-    turned = [_turned(rays, turn) for turn in turns]
+    turned = [turned_rays(rays, turn) for turn in turns]
     ranges, clearances = np.empty((2, len(turned), rays.shape[1]))
     for one, away, aside in zip(turned, ranges, clearances, strict=True):
         cast_rays(OUTLINES, number, p, one, away)
@@ -168,7 +144,7 @@ def silhouette_readings(
     limits, rays = sensor.options, bundle.rays
     holds, between = [], []
     for angle in angles:
-        sides = [ranges_to(shape, _turned(rays, turn)) for turn in (-angle, 0.0, angle)]
+        sides = [ranges_to(shape, turned_rays(rays, turn)) for turn in (-angle, 0.0, angle)]
         near = np.minimum.reduce(sides)
         held = (near < FAR) & (np.maximum(sides[0], sides[2]) == FAR) & (near < rays[OCCLUSION])
         held &= bundle.outcomes == MEASURED

@@ -44,7 +44,7 @@ from detect.refinement.likelihood.kernels import (
     likelihood_table,
     occlude,
 )
-from detect.refinement.likelihood.rays import RayBundle
+from detect.refinement.likelihood.rays import RayBundle, turned_rays
 from detect.refinement.likelihood.traversal import cast_through_map
 from detect.refinement.options import DEFAULTS, SensorOptions
 from mapping.grid import GridFrame
@@ -192,22 +192,26 @@ def background_log_likelihood(bundle: RayBundle, background: Background, sensor:
     return np.asarray(np.log(likelihood))
 
 
-def occlusion_by(bundle: RayBundle, occluders: Sequence[Primitive], ranges: Sequence[FloatArray] = ()) -> FloatArray:
-    """Compute where rays meet the first of some things that may stand before a primitive or the background.
+def occlusion_by(bundle: RayBundle, occluders: Sequence[Primitive], reach: float = 0.0) -> FloatArray:
+    """Compute where beams meet the first of some things that may stand before a primitive or the background.
 
     Args:
         bundle: N rays.
         occluders: Other primitives and walls.
-        ranges: Ranges (N,) in m to further things; FAR where a ray misses them.
+        reach: Angle (rad) on both sides of a beam's axis within which the nearest surface is met.
 
     Returns:
-        (N,) ranges in m; FAR where a ray meets none.
+        (N,) ranges in m; FAR where a beam meets none.
     """
-    rays = bundle.rays.copy()
-    rays[OCCLUSION] = np.minimum.reduce(ranges, initial=FAR) if ranges else FAR
-    for other in occluders:
-        occlude(OUTLINES, NUMBERS[other.kind], parameters_of(other), other.bounding_radius, rays)
-    return np.asarray(rays[OCCLUSION])
+    nearest = np.full(len(bundle), FAR)
+    turns = () if not occluders else (-reach, 0.0, reach) if reach else (0.0,)
+    for turn in turns:
+        rays = turned_rays(bundle.rays, turn)
+        rays[OCCLUSION] = FAR
+        for other in occluders:
+            occlude(OUTLINES, NUMBERS[other.kind], parameters_of(other), other.bounding_radius, rays)
+        nearest = np.minimum(nearest, rays[OCCLUSION])
+    return nearest
 
 
 def with_background(

@@ -16,7 +16,7 @@ from detect.refinement.likelihood.geometry import JACOBIANS, parameters_of, rang
 from detect.refinement.likelihood.kernels import BACKGROUND, FAR, OCCLUSION, RANGE
 from detect.refinement.likelihood.rays import RayBundle
 from detect.refinement.likelihood.scanner_errors import ScannerErrors, Surroundings, without_errors
-from detect.refinement.likelihood.sensor_model import Background, BeamModel
+from detect.refinement.likelihood.sensor_model import Background, BeamModel, occlusion_by
 from detect.refinement.refine import Refinement
 from detect.refinement.scanner_errors import BiasExpansion, Profile, common_step, errors_of, with_shared_errors
 from detect.refinement.surroundings.levels import MapLevels
@@ -103,7 +103,8 @@ def without(rays: np.ndarray, errors: ScannerErrors, walls: tuple[Primitive, ...
     """The rays of a bundle whose background is 2.5 m away, without errors, for a circle of 0.1 m at the origin."""
     count = rays.shape[1]
     background = Background(np.full(count, 2.5), np.ones(count, np.bool_), np.zeros(count, np.bool_), 0.005)
-    around = Surroundings(background, np.full(count, -1.5), (), walls)
+    met = occlusion_by(bundle_of(rays), walls, errors.reach)
+    around = Surroundings(background, np.full(count, -1.5), met, np.full(count, FAR))
     circle = Primitive(Kind.CIRCLE, 0.0, 0.0, None, (0.1,))
     return without_errors(bundle_of(rays), around, circle, BeamModel.create(NOISE, 5.0), errors).rays
 
@@ -127,7 +128,8 @@ def test_near_a_silhouette_a_wide_beam_is_turned_inwards_and_reads_what_is_neare
     """The near end of a plate that is seen at a slant is its silhouette."""
     plate, rays = Primitive(Kind.RECTANGLE, 0.0, 0.0, math.pi / 4, (0.4, 0.02)), rays_along_x(-0.135)
     background = Background(np.full(1, 2.5), np.ones(1, np.bool_), np.zeros(1, np.bool_), 0.005)
-    around, sensor = Surroundings(background, np.full(1, -1.5), (), ()), BeamModel.create(NOISE, 5.0)
+    nothing, sensor = np.full(1, FAR), BeamModel.create(NOISE, 5.0)
+    around = Surroundings(background, np.full(1, -1.5), nothing, nothing)
     turned = without_errors(bundle_of(rays), around, plate, sensor, ScannerErrors(reach=0.01)).rays
     parts = rays_along_x(*np.full(201, -0.135))
     parts[2], parts[3] = np.cos(turns := np.linspace(-0.01, 0.01, 201)), np.sin(turns)
@@ -143,7 +145,8 @@ def test_only_readings_between_two_surfaces_at_a_silhouette_are_left_out() -> No
     rays[BACKGROUND] = -9.0
     count = rays.shape[1]
     background = Background(np.full(count, 2.5), np.ones(count, np.bool_), np.zeros(count, np.bool_), 0.005)
-    around = Surroundings(background, np.where(rays[RANGE] == 2.5, -1.0, -9.0), (), ())
+    nothing = np.full(count, FAR)
+    around = Surroundings(background, np.where(rays[RANGE] == 2.5, -1.0, -9.0), nothing, nothing)
     circle = Primitive(Kind.CIRCLE, 0.0, 0.0, None, (0.1,))
     errors = ScannerErrors(mixed=0.01)
     corrected = without_errors(bundle_of(rays), around, circle, BeamModel.create(NOISE, 5.0), errors)
