@@ -49,6 +49,7 @@ class PoseSourceName(StrEnum):
     TF = "tf"
     ODOM = "odom"
     FUSED = "fused"
+    SCANS = "scans"
 
 
 DEFAULT_SIZES = (0.05, 2.0)

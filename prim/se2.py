@@ -238,6 +238,12 @@ def integrate_steps(steps: FloatArray, start: FloatArray | None = None) -> Float
     return np.column_stack((x + np.cumsum(dx), y + np.cumsum(dy), heading))
 
 
+def path_length(poses: FloatArray) -> float:
+    """Return the length (m) of the way along poses (N, 3)."""
+    steps = np.diff(poses[:, :2], axis=0)
+    return float(np.hypot(steps[:, 0], steps[:, 1]).sum())
+
+
 def compose_covariances(covariances: FloatArray, poses: FloatArray, children: FloatArray) -> FloatArray:
     """Carry covariances of poses over to frames that are mounted on them without error.
 

@@ -11,13 +11,24 @@ import numpy as np
 from numpy.typing import NDArray
 
 from prim.arrays import Stamps
-from prim.choices import SweepName
+from prim.choices import PoseSourceName, SweepName
 from prim.errors import LogReadError
 from prim.scan import PosedScan
+from prim.se2 import compose_poses, inverse_poses
 from replay.options import ReplayOptions
 from replay.poses.fusion_options import FusionInputs, SensorNoise
-from replay.poses.laser_poses import AT_ONCE, BEAM_TIMES, FUSED, BeamTimes, LaserPoses, ScanTimes, stated_beam_times
-from replay.poses.pose_provider import PoseProvider
+from replay.poses.laser_poses import (
+    AT_ONCE,
+    BEAM_TIMES,
+    EXACT_SOURCES,
+    FUSED,
+    SCANS,
+    BeamTimes,
+    LaserPoses,
+    ScanTimes,
+    stated_beam_times,
+)
+from replay.poses.pose_provider import NoPosesError, PoseProvider
 from replay.scans.posed_scans import PosedScanOptions, PosedScans
 from replay.scans.scan_log import ScanLog
 from replay.timing import StageTimer
@@ -68,6 +79,8 @@ def localize(scans: ScanLog, options: ReplayOptions, timer: StageTimer) -> Local
     """
     provider = PoseProvider(scans.log, options.odom_topic, options.laser_offset, options.fuse)
     found = _look_up_poses(provider, _retimed(scans, options), options)
+    if found.poses.source == SCANS:
+        return _matched(found, options, timer)
     if options.sweep == SweepName.AUTO:
         found = _with_beam_times_that_fit(provider, found, options, timer)
     elif not scans.sweep:
@@ -75,18 +88,35 @@ def localize(scans: ScanLog, options: ReplayOptions, timer: StageTimer) -> Local
         found = found._replace(notes=(*found.notes, note))
     if found.poses.mount_assumed and len(scans.scanners) == 1:
         found = found._replace(poses=_with_suggested_mount(found.poses, found.scans, options, timer))
-    if not options.match_scans:
-        return found
+    return _matched(found, options, timer) if options.match_scans else found
+
+
+def _matched(found: Localization, options: ReplayOptions, timer: StageTimer) -> Localization:
+    """Match all scans: tracked by their points where the noise is below the cells, else by the forward map of all.
+
+    The forward map takes poses that are known within its reach: those of odometry, else tracked ones.
+    """
     from replay.mapping.bounds import bounds_of_bulk  # when they are needed: a replay without them starts faster
     from replay.poses.scan_matching import match_scans
+    from replay.poses.tracking.laser_track import track_poses
 
-    scans = found.scans
+    scans, poses = found.scans, found.poses
     posed = partial(pose_scans, scans, options=options, timer=timer)
-    bounds = options.bounds or bounds_of_bulk(posed(found.poses), options.resolution)
-    poses = match_scans(
-        found.poses, scans.stamps, posed, options.resolution, options.noise_std, options.fuse.noise, bounds
-    )
+    if poses.source == SCANS or _drift(poses, options.fuse.noise):
+        tracked, track = track_poses(poses, scans.times, posed, options.resolution)
+        if track.noise_std < options.resolution:
+            return found._replace(poses=replace(tracked, matched=True))
+        if poses.source == SCANS or track.stands_still:
+            poses = tracked
+    bounds = options.bounds or bounds_of_bulk(posed(poses), options.resolution)
+    poses = match_scans(poses, scans.stamps, posed, options.resolution, options.noise_std, options.fuse.noise, bounds)
     return found._replace(poses=poses)
+
+
+def _drift(poses: LaserPoses, noise: SensorNoise) -> bool:
+    """Tell whether poses are those of an odometry, which no sensor holds."""
+    is_known = noise.position_std is not None and noise.heading_std is not None
+    return poses.fusion is None and not is_known and poses.source not in EXACT_SOURCES
 
 
 def pose_scans(scans: ScanLog, poses: LaserPoses, options: ReplayOptions, timer: StageTimer) -> PosedScans:
@@ -125,7 +155,14 @@ def _look_up_poses(provider: PoseProvider, scans: ScanLog, options: ReplayOption
     times = scans.times if options.deskew else scans.times.at_once()
     if options.standing_still:
         return Localization(scans, provider.stationary_poses(times), None, ())
-    poses = provider.laser_poses(times, options.pose)
+    try:
+        if options.pose == SCANS:
+            return _at_rest(provider, scans, times, ())
+        poses = provider.laser_poses(times, options.pose)
+    except NoPosesError as error:
+        if options.pose != PoseSourceName.AUTO:
+            raise
+        return _at_rest(provider, scans, times, (f"{error.what}: they are found by the scans alone",))
     fuse = replace(options.fuse, noise=SensorNoise()) if options.match_scans else options.fuse
     notes = []
     if fuse != FusionInputs() and poses.source != FUSED:
@@ -139,6 +176,21 @@ def _look_up_poses(provider: PoseProvider, scans: ScanLog, options: ReplayOption
         except LogReadError as error:
             notes.append(f"the poses are not held against the truth: {error.what}")
     return Localization(scans, poses, true_poses, tuple(notes))
+
+
+def _at_rest(provider: PoseProvider, scans: ScanLog, times: ScanTimes, notes: tuple[str, ...]) -> Localization:
+    """Return the poses that tracking by the scans alone begins with: at the first true one, else at the origin."""
+    poses = replace(provider.stationary_poses(times), source=SCANS, origin=scans.names)
+    if not provider.has_truth:
+        return Localization(scans, poses, None, notes)
+    try:
+        true_poses = provider.laser_poses(times, "truth")
+    except LogReadError as error:
+        return Localization(scans, poses, None, (*notes, f"the poses are not held against the truth: {error.what}"))
+    first = np.flatnonzero(true_poses.valid)[:1]
+    robot = compose_poses(true_poses.poses[first], inverse_poses(poses.poses[first]))
+    begun = compose_poses(np.repeat(robot, len(poses.poses), axis=0), poses.poses)
+    return Localization(scans, replace(poses, poses=begun, mounts=poses.poses), true_poses, notes)
 
 
 def _with_beam_times_that_fit(

@@ -48,6 +48,7 @@ ARROWS: dict[str, set[str]] = {
     },
     "replay/scans": {"prim", "prim/log", "prim/log/decoding", "replay", "replay/poses"},
     "replay/poses": {"prim", "prim/log", "prim/log/decoding", "mapping", "mapping/forward"},
+    "replay/poses/tracking": {"prim", "mapping", "replay/poses"},
     "replay/detection": {
         "prim", "mapping", "detect", "detect/networks", "detect/refinement", "detect/refinement/surroundings",
         "replay", "replay/poses", "replay/scans",
@@ -62,7 +63,7 @@ ARROWS: dict[str, set[str]] = {
     "replay": {
         "prim", "prim/log", "prim/log/decoding", "mapping", "mapping/forward", "detect", "detect/networks",
         "detect/refinement", "detect/refinement/surroundings", "replay/scans", "replay/detection", "replay/mapping",
-        "replay/outputs", "replay/poses",
+        "replay/outputs", "replay/poses", "replay/poses/tracking",
         "replay/viewing",
     },
 }  # fmt: skip
@@ -119,7 +120,8 @@ NUMBERS = {
         "ENTRY_RANGE MAX_RANGE COLLECTED_ROWS SCRATCH_ROWS BOX ROUND TRIANGLE POLYGON MEASURED TOO_NEAR NO_RETURN "
         "INVALID CENSORED_MOMENTS HITS PASSES SQUARES_OF_ARRIVAL SKIPPED HIT FREE OCCUPIED UNSEEN "
         "USED REJECTED MIN_BLOCKS MAX_BLOCKS BLOCK_CELLS POSE "
-        "OFFSET ALONG HIGH LOW ALONG_HIGH ALONG_LOW AT_HIGH AT_LOW NEAREST EDGE FARTHEST RANGE"
+        "OFFSET ALONG HIGH LOW ALONG_HIGH ALONG_LOW AT_HIGH AT_LOW NEAREST EDGE FARTHEST RANGE "
+        "X Y NORMAL_X NORMAL_Y FULL_SCORE"
     ),
     "mathematics": "NORMAL_MAD NORMAL_MEDIAN EQUATORIAL_RADIUS FLATTENING OUTLINE_POINTS",
     "rounding and the infinite": (

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from prim.arrays import FloatArray, Stamps
-from prim.se2 import integrate_steps, wrap_angles
+from prim.se2 import compose_poses, integrate_steps, inverse_poses, wrap_angles
 from replay.poses.fusion_nodes import FusionNodes
 from replay.poses.fusion_options import FusionOptions, SensorNoise
 from replay.poses.kalman import (
@@ -74,6 +74,44 @@ class PoseEstimate:
             self.poses, pack_symmetric(self.covariances), self.gains, selected
         )
         return covariance
+
+    def seen_from_first(self, first: FilterState) -> PoseEstimate:
+        """Move all poses together, so that the first one is where it is known to be.
+
+        Errors of the first pose are then those of all: covariances are those of the motion since it.
+
+        Args:
+            first: What is known of the first pose.
+
+        Returns:
+            The moved poses, without gains.
+
+        Raises:
+            ValueError: The poses are not smoothed.
+        """
+        if self.gains is None:
+            raise ValueError("the errors of poses that are not smoothed have no known correlation")
+        count, at_first = len(self.poses), self.covariances[0]
+        # by how much an error of the first pose, which turns and shifts all that follows, moves the others
+        carried = np.broadcast_to(np.eye(3), (count, 3, 3)).copy()
+        carried[:, 0, 2] = self.poses[0, 1] - self.poses[:, 1]
+        carried[:, 1, 2] = self.poses[:, 0] - self.poses[0, 0]
+        shared, regression = np.empty((count, 3, 3)), np.eye(3)
+        for k, covariance in enumerate(self.covariances):  # of the first pose's error with that of each
+            shared[k] = regression @ covariance
+            regression = regression @ self.gains[k]
+        shared = carried @ shared
+        since = self.covariances - shared - shared.transpose(0, 2, 1)
+        since += carried @ at_first @ carried.transpose(0, 2, 1)
+        origin = compose_poses(first.pose[None], inverse_poses(self.poses[:1]))
+        poses = compose_poses(np.repeat(origin, count, axis=0), self.poses)
+        poses[:, 2] = wrap_angles(poses[:, 2])
+        turn = np.eye(3)
+        cos, sin = math.cos(origin[0, 2]), math.sin(origin[0, 2])
+        turn[:2, :2] = [[cos, -sin], [sin, cos]]
+        turned = turn @ carried @ turn.T
+        known = turned @ unpack_symmetric(first.covariance) @ turned.transpose(0, 2, 1)
+        return replace(self, poses=poses, covariances=turn @ since @ turn.T + known, gains=None)
 
     def reading_counts(self, sensor: int) -> tuple[int, int]:
         """Return how many readings of GPS (0) or compass (1) were used, and how many were rejected."""
@@ -148,7 +186,11 @@ class Fusion:
         return FilterState(output.poses[-1].copy(), output.covariances[-1].copy())
 
     def smoothed(
-        self, scans: QuadraticTerms | None = None, inflation: float = 1.0, count: int | None = None
+        self,
+        scans: QuadraticTerms | None = None,
+        inflation: float = 1.0,
+        count: int | None = None,
+        starts_free: bool = False,
     ) -> PoseEstimate:
         """Estimate each pose from all measurements.
 
@@ -156,13 +198,18 @@ class Fusion:
             scans: The scans' log-likelihoods of the poses at the nodes.
             inflation: The factor of the odometry's variances.
             count: Use only the first so many nodes and their measurements; None: all.
+            starts_free: Whether the first pose is anywhere near where it begins: in the frame of a map that the scans
+                were matched with, it is known no better than others.
 
         Returns:
             The poses at the nodes, with the gains of the smoother.
         """
         nodes = self.nodes.subrange(0, count)
         scans = None if scans is None else QuadraticTerms(*(rows[:count] for rows in scans))
-        output = self._run(nodes, self._inflated(inflation), scans)
+        initial = None
+        if starts_free:
+            initial = FilterState(self._initial.pose, self._options.initial_free_std**2 * pack_symmetric(np.eye(3)))
+        output = self._run(nodes, self._inflated(inflation), scans, initial)
         gains = np.zeros((len(output.poses), 3, 3))
         smooth(output, gains)
         return self._estimate(nodes.stamps, output, gains)

@@ -133,6 +133,10 @@ class FusionOptions:
     initial_known_std: float = 1e-5
     """Standard deviation (m, rad) of an initial pose that defines the map frame, since no sensor is absolute."""
 
+    initial_free_std: float = 1.0
+    """Standard deviation (m, rad) of the initial pose in the frame of a map that scans are matched with; set by hand:
+    far above what a scan leaves open."""
+
     initial_compass_std: float = 0.5
     """Standard deviation of the initial heading (rad) from a compass; set by hand."""
 

@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from replay.poses.fusion import Fusion
 
 FUSED = PoseSourceName.FUSED.value
+SCANS = PoseSourceName.SCANS.value
 
 STILL = "still"
 """The source of poses of a robot that stands still."""

@@ -57,6 +57,10 @@ class PoseProviderOptions:
 DEFAULTS = PoseProviderOptions()
 
 
+class NoPosesError(LogReadError):
+    """A log without poses, of any source."""
+
+
 class _TfLink(NamedTuple):
     """How a laser is found in tf.
 
@@ -76,7 +80,8 @@ class _TfLink(NamedTuple):
 class PoseProvider:
     """Provides the laser's pose at every scan, from what a log holds: true poses, tf, odometry, or several sensors.
 
-    Scans are not matched here; see :func:`replay.poses.scan_matching.match_scans`.
+    Scans are not matched here; see :func:`replay.poses.scan_matching.match_scans`, and, for poses from scans alone,
+    :func:`replay.poses.tracking.laser_track.track_poses`.
 
     Args:
         log: The log.
@@ -106,14 +111,15 @@ class PoseProvider:
 
         Args:
             scans: When the scans were taken.
-            source: One of PoseSourceName. ``auto`` means ``odom`` where an ``odom_topic`` was given; else it
-                takes the ground truth, else a tf chain to ``map``, else what can be fused with a GPS or a compass,
-                else any tf chain, else odometry.
+            source: One of PoseSourceName but ``scans``. ``auto`` means ``odom`` where an ``odom_topic`` was given;
+                else it takes the ground truth, else a tf chain to ``map``, else what can be fused with a GPS or a
+                compass, else any tf chain, else odometry.
 
         Returns:
             The poses; those of scans outside the time of the source are marked as invalid.
 
         Raises:
+            NoPosesError: There are no poses at all.
             LogReadError: The source is not there or cannot be used, or no scan lies within its time.
         """
         poses = _split_end_poses(self._poses_from(source, scans), len(scans.stamps))
@@ -192,7 +198,7 @@ class PoseProvider:
         topic = find_pose_topic(self._log, self._odom_topic)
         if topic is None:
             everything = "no ground truth, no tf chain, " if source == "auto" else ""
-            raise LogReadError(
+            raise NoPosesError(
                 self._log.path,
                 f"no poses for frame {scans.frame_ids[0]!r}: {everything}no Odometry or PoseStamped",
                 "; ".join(

@@ -131,6 +131,10 @@ def match_scans(
     return ScanMatcher(poses, stamps, source, resolution, noise_std, noise, bounds, options).run()
 
 
+_State = tuple[FloatArray, FloatArray, FloatArray | None]
+"""Poses and covariances at the nodes, and the covariance of the map's frame."""
+
+
 class ScanMatcher:
     """The implementation and state of :func:`match_scans`, and with its arguments.
 
@@ -152,12 +156,18 @@ class ScanMatcher:
         self._poses, self._source, self._options = poses, source, options
         self._resolution, self._noise_std, self._bounds = resolution, noise_std, bounds
         self._fusion = poses.fusion or _fusion_of(poses, stamps, noise or SensorNoise(), options)
-        self._drifts = not self._fusion.nodes.has_fix.any()
+        has_fixes, has_headings = self._fusion.nodes.has_fix.any(), self._fusion.nodes.has_heading.any()
+        self._drifts = not has_fixes
+        # where no sensor is absolute, the first pose is known, and the map, made of all scans, is somewhere near
+        self._floats = not has_fixes and not has_headings
         self._mounts = np.zeros_like(poses.poses) if poses.mounts is None else poses.mounts
         nodes = self._fusion.nodes.stamps
         self._node_of_scan = np.searchsorted(nodes, np.clip(stamps, nodes[0], nodes[-1]))
         estimate = self._fusion.smoothed()
         self._node_poses, self._covariances = estimate.poses, pack_symmetric(estimate.covariances)
+        self._frame_covariance = poses.frame_covariance
+        if self._frame_covariance is None and has_fixes:
+            self._frame_covariance = estimate.frame_covariance(stamps)
         self._rays: dict[int, ScanRays] = {}
         self._scans: list[PosedScan] = []
         self._inflation = 1.0
@@ -216,24 +226,32 @@ class ScanMatcher:
             count: The number of nodes that the scans so far belong to; None: all.
         """
         best, noise_scale = -math.inf, 0.0
-        before = self._node_poses, self._covariances
-        for _ in range(max_rounds):
+        before: _State | None = None  # that of the round before, smoothed by a map of all
+        for number in range(max_rounds):
             fit = self._mapper_of_scans().fit()
             likelihood = ScanLikelihood.of(fit, fit.noise)
             noise_scale = noise_scale or self._first_noise_scale(pose_error, likelihood)
             mean, terms = self._match_all(likelihood, noise_scale)
-            if noise_scale == 1.0 and mean < best:
-                self._node_poses, self._covariances = before
-            if noise_scale == 1.0 and mean - best < self._options.min_gain:
-                break
-            best = mean if noise_scale == 1.0 else best
+            if before is not None and noise_scale == 1.0:
+                if mean < best:
+                    self._node_poses, self._covariances, self._frame_covariance = before
+                if mean - best < self._options.min_gain:
+                    break
+                best = mean
             noise_scale = max(noise_scale / 2, 1.0)
-            before = self._node_poses.copy(), self._covariances.copy()
+            before = self._state() if number else None
             self._smooth(terms, count)
+
+    def _state(self) -> _State:
+        """Return copies of the estimates."""
+        return self._node_poses.copy(), self._covariances.copy(), self._frame_covariance
 
     def _smooth(self, terms: QuadraticTerms, count: int | None) -> None:
         """Smooth the poses of the first ``count`` nodes with the scans' log-likelihoods."""
-        estimate = self._fusion.smoothed(terms, self._inflation, count)
+        estimate = self._fusion.smoothed(terms, self._inflation, count, self._floats)
+        if self._floats:
+            self._frame_covariance = _covariance_at_origin(estimate.poses[0], estimate.covariances[0])
+            estimate = estimate.seen_from_first(self._fusion.initial_state)
         self._node_poses[:count] = estimate.poses
         self._covariances[:count] = pack_symmetric(estimate.covariances)
         self._inflation = max(self._inflation, self._step_inflation(count))
@@ -338,10 +356,15 @@ class ScanMatcher:
         covariances = compose_covariances(carrier_covariances, carriers, self._mounts)
         # the variance of a surface's place within its cell, which the map does not resolve
         covariances[:, [0, 1], [0, 1]] += self._resolution**2 / 12
-        if self._poses.frame_covariance is not None:
-            covariances = covariances + frame_covariances(self._poses.frame_covariance, poses)
+        if self._frame_covariance is not None and not self._floats:
+            covariances = covariances + frame_covariances(self._frame_covariance, poses)
         return replace(
-            self._poses, poses=poses, end_poses=self._end_poses(poses), covariances=covariances, matched=True
+            self._poses,
+            poses=poses,
+            end_poses=self._end_poses(poses),
+            covariances=covariances,
+            frame_covariance=self._frame_covariance,
+            matched=True,
         )
 
     def _end_poses(self, poses: FloatArray) -> FloatArray | None:
@@ -364,6 +387,12 @@ def reposed(posed: PosedScan, pose: Pose2D) -> Iterator[tuple[Scan, Pose2D]]:
     back = Pose2D(posed.pose.x, posed.pose.y, posed.pose.theta).inverse()
     for scan, at in posed.pieces:
         yield scan, pose @ (back @ Pose2D(at.x, at.y, at.theta))
+
+
+def _covariance_at_origin(pose: FloatArray, covariance: FloatArray) -> FloatArray:
+    """Return the covariance (3, 3) of the motion of a frame, at its origin, by which a pose's errors move it."""
+    carried = np.array([[1.0, 0.0, pose[1]], [0.0, 1.0, -pose[0]], [0.0, 0.0, 1.0]])
+    return np.asarray(carried @ covariance @ carried.T)
 
 
 def _fusion_of(poses: LaserPoses, stamps: Stamps, noise: SensorNoise, options: ScanMatchingOptions) -> Fusion:

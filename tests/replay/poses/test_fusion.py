@@ -13,7 +13,7 @@ from prim.se2 import Trajectory, integrate_steps, wrap_angles
 from replay.poses.fusion import Fusion, PoseEstimate
 from replay.poses.fusion_nodes import FusionNodes, weighted_path_lengths
 from replay.poses.fusion_options import FusionOptions, NoiseEstimationOptions, SensorNoise
-from replay.poses.kalman import REJECTED
+from replay.poses.kalman import REJECTED, FilterState
 
 SECOND = 10**9
 TRUE_NOISE = SensorNoise(0.1, math.radians(3), 0.05, math.radians(2), 0.0)
@@ -118,6 +118,18 @@ def test_smoother_and_frame_covariance_agree_with_the_joint_posterior() -> None:
     poses = found.poses
     motion = np.hstack([[[1, 0, y], [0, 1, -x], [0, 0, 1]] for x, y, _ in poses]) / count
     assert found.frame_covariance(stamps) == pytest.approx(motion @ covariance @ motion.T, rel=1e-6, abs=1e-12)
+
+    known = FilterState(np.array([2.0, -1.0, 1.3]), np.array([1e-6, 0, 0, 4e-6, 0, 9e-6]))
+    moved = found.seen_from_first(known)
+    turn = np.array([[math.cos(t := 1.3 - poses[0, 2]), -math.sin(t), 0], [math.sin(t), math.cos(t), 0], [0, 0, 1]])
+    for k, (x, y, theta) in enumerate(poses - poses[0]):
+        # to first order in the errors of both: where this one is seen from the first, whose own error moves it
+        carried = np.array([[1, 0, -y], [0, 1, x], [0, 0, 1]])
+        both = covariance[np.ix_(rows := [0, 1, 2, 3 * k, 3 * k + 1, 3 * k + 2], rows)]
+        apart = np.hstack((-carried, np.eye(3)))
+        spread = apart @ both @ apart.T + carried @ turn.T @ np.diag([1e-6, 4e-6, 9e-6]) @ turn @ carried.T
+        assert moved.poses[k] == pytest.approx([2, -1, 1.3] + turn @ [x, y, theta], abs=1e-12)
+        assert moved.covariances[k] == pytest.approx(turn @ spread @ turn.T, abs=1e-10)
 
 
 @pytest.mark.parametrize("seed", range(3))

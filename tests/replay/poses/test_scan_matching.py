@@ -13,7 +13,7 @@ from mapping.forward.mapper import ForwardMapper
 from mapping.forward.scan_likelihood import ScanLikelihood, ScanRays, maximize_pose
 from prim.arrays import FloatArray
 from prim.log import open_log
-from prim.metrics import pose_rmse
+from prim.metrics import pose_nees, pose_rmse
 from prim.scan import PosedScan, Scan, deskew
 from prim.se2 import Pose2D, wrap_angles
 from prim.shapes import Kind, Primitive
@@ -122,6 +122,25 @@ def test_matched_poses_are_more_accurate(driven: Path, source: str, share: float
     assert after[0] < share * before[0] and after[1] < before[1]
     assert after[0] < 0.03
     assert matched.matched and matched.covariances is not None and matched.source == source
+
+
+def test_covariances_hold_where_the_first_pose_alone_is_known(tmp_path: Path) -> None:
+    """The map is where all scans put it; that the first one is off in it moves all (NEES: 3 in expectation)."""
+    values = []
+    for seed in range(3):
+        path = tmp_path / f"{seed}.mcap"
+        lidar = Lidar(rays=200, noise_std=0.03)
+        record_session(path, SessionOptions(seed=seed, motion="drive", duration=20.0, rate=5.0, lidar=lidar))
+        with open_log(path) as log:
+            scans = ScanLog(log, Selection())
+            truth = PoseProvider(log).laser_poses(scans.times, "truth").poses
+            odometry = PoseProvider(log).laser_poses(scans.times, "odom")
+            matched = match_scans(odometry, scans.stamps, partial(PosedScans, scans), 0.02)
+        assert matched.covariances is not None and matched.frame_covariance is not None
+        values.append(pose_nees(matched.poses, truth, matched.covariances))
+        assert matched.poses[0] == pytest.approx(truth[0], abs=1e-6)
+        assert 1e-3 < math.sqrt(matched.frame_covariance[0, 0]) < 0.03
+    assert 1.5 < np.median(values) < 5
 
 
 def test_matching_reduces_the_noise_of_poses_that_do_not_drift(driven: Path) -> None:

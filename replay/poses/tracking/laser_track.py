@@ -1,0 +1,117 @@
+"""A log's poses by tracking its scans, and what a user should know of them."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable
+from dataclasses import replace
+
+import numpy as np
+
+from prim.arrays import FloatArray
+from prim.scan import PosedScan
+from prim.se2 import Trajectory, compose_poses, inverse_poses, path_length, wrap_angles
+from replay.poses.laser_poses import SCANS, LaserPoses, ScanTimes
+from replay.poses.tracking.options import DEFAULTS, TrackingOptions
+from replay.poses.tracking.scan_tracker import ScanTrack, track
+
+PosedScanSource = Callable[[LaserPoses], Iterable[PosedScan]]
+"""Yields the scans of a log with the poses that it is given."""
+
+
+def track_poses(
+    poses: LaserPoses,
+    times: ScanTimes,
+    source: PosedScanSource,
+    settled_noise: float = math.inf,
+    options: TrackingOptions = DEFAULTS,
+) -> tuple[LaserPoses, ScanTrack]:
+    """Find a log's poses by its scans, with its odometry or without.
+
+    The scans of the first laser are tracked; others follow by their places on the robot.
+
+    Args:
+        poses: The laser's poses at N scans by odometry; or, of the source ``scans``, those of a robot that stands
+            still, from which they are found.
+        times: When the scans were taken, and by which laser.
+        source: Yields the scans with the poses that it is given.
+        settled_noise: As :func:`replay.poses.tracking.scan_tracker.track` has it.
+        options: Windows, maps, limits.
+
+    Returns:
+        The poses, the first one as it was, with notes; and the track.
+    """
+    alone = poses.source == SCANS
+    mounts = poses.poses if alone and poses.mounts is None else _mounts_of(poses)
+    placed, found = _tracked(poses, mounts, times, source, not alone, settled_noise, options)
+    if alone and placed.end_poses is not None:  # how the laser moves during a sweep is known now
+        placed, found = _tracked(placed, mounts, times, source, True, settled_noise, options)
+    notes = track_notes(found, None if alone else poses, times)
+    return replace(placed, notes=(*poses.notes, *notes)), found
+
+
+def _tracked(
+    poses: LaserPoses,
+    mounts: FloatArray,
+    times: ScanTimes,
+    source: PosedScanSource,
+    predicts: bool,
+    settled_noise: float,
+    options: TrackingOptions,
+) -> tuple[LaserPoses, ScanTrack]:
+    """ScanTrack the first laser's scans, predicted by the poses or not, and place all lasers' by these."""
+    scans = sorted((posed for posed in source(poses) if not posed.scanner), key=lambda posed: posed.scan.stamp)
+    at = np.array([posed.position for posed in scans])
+    found = track(scans, poses.poses[at] if predicts else None, settled_noise, options)
+    lasers = compose_poses(np.repeat(poses.poses[at[:1]], len(at), axis=0), found.poses)
+    robot = Trajectory.from_unsorted(times.stamps[at], compose_poses(lasers, inverse_poses(mounts[at])))
+    count = len(poses.poses)
+    stamps = times.query_stamps
+    places, within = robot.at(stamps)
+    whole = compose_poses(places[:count], mounts)
+    whole[:, 2] = wrap_angles(whole[:, 2])
+    ends = compose_poses(places[count:], mounts) if poses.end_poses is not None else None
+    several = mounts if len(times.frame_ids) > 1 else poses.mounts
+    valid = poses.valid & within[:count]
+    return replace(poses, poses=whole, end_poses=ends, valid=valid, mounts=several), found
+
+
+def _mounts_of(poses: LaserPoses) -> FloatArray:
+    """Return the lasers' poses (N, 3) on the robot; zeros where those of a single one are the robot's."""
+    return np.zeros_like(poses.poses) if poses.mounts is None else poses.mounts
+
+
+def track_notes(found: ScanTrack, odometry: LaserPoses | None, times: ScanTimes) -> tuple[str, ...]:
+    """Return what a user should know of a track: where odometry was not followed, and where scans fit nowhere.
+
+    Args:
+        found: The track.
+        odometry: The poses that it was predicted by; None for none.
+        times: When the scans were taken.
+
+    Returns:
+        The notes.
+    """
+    notes: list[str] = []
+    count, begin = len(found.poses), times.stamps.min()
+    if odometry is not None:
+        given, tracked = path_length(odometry.poses[odometry.valid]), path_length(found.poses)
+        if found.stands_still:
+            notes.append(
+                f"{odometry.origin} moves by {given:.2f} m where the scans move by {tracked:.1f} m: they are followed"
+            )
+        elif found.overruled:
+            stamps = np.sort(times.stamps[odometry.valid])[list(found.overruled)]
+            seconds = (int(stamps[0]) - int(begin)) / 1e9
+            what = "scan" if len(found.overruled) == 1 else "scans"
+            notes.append(
+                f"{odometry.origin} jumps at {len(found.overruled)} {what} of {count}, first at {seconds:.1f} s: "
+                "the scans are followed there"
+            )
+    if found.broken:
+        what = "scan fits" if len(found.broken) == 1 else "scans fit"
+        notes.append(
+            f"{len(found.broken)} {what} nowhere near those before, the first one number {found.broken[0]}: "
+            "what lies before and after may not belong together"
+        )
+    return tuple(notes)
