@@ -14,7 +14,7 @@ from prim.arrays import Stamps
 from prim.choices import PoseSourceName, SweepName
 from prim.errors import LogReadError
 from prim.scan import PosedScan
-from prim.se2 import compose_poses, inverse_poses
+from prim.se2 import compose_poses, inverse_poses, path_length
 from replay.options import ReplayOptions
 from replay.poses.fusion_options import FusionInputs, SensorNoise
 from replay.poses.laser_poses import (
@@ -79,6 +79,7 @@ def localize(scans: ScanLog, options: ReplayOptions, timer: StageTimer) -> Local
     """
     provider = PoseProvider(scans.log, options.odom_topic, options.laser_offset, options.fuse)
     found = _look_up_poses(provider, _retimed(scans, options), options)
+    found = _where_scans_fit(provider, found, options, timer)
     if found.poses.source == SCANS:
         return _matched(found, options, timer)
     if options.sweep == SweepName.AUTO:
@@ -92,25 +93,83 @@ def localize(scans: ScanLog, options: ReplayOptions, timer: StageTimer) -> Local
 
 
 def _matched(found: Localization, options: ReplayOptions, timer: StageTimer) -> Localization:
-    """Match all scans: tracked by their points where the noise is below the cells, else by the forward map of all.
+    """Match all scans: tracked by their points where cells are coarse and the noise is below them; else by a map.
 
-    The forward map takes poses that are known within its reach: those of odometry, else tracked ones.
+    That is the forward map of all, which takes poses within its reach: those of odometry, else tracked ones.
     """
     from replay.mapping.bounds import bounds_of_bulk  # when they are needed: a replay without them starts faster
     from replay.poses.scan_matching import match_scans
     from replay.poses.tracking.laser_track import track_poses
+    from replay.poses.tracking.options import DEFAULTS as TRACKING
 
     scans, poses = found.scans, found.poses
     posed = partial(pose_scans, scans, options=options, timer=timer)
     if poses.source == SCANS or _drift(poses, options.fuse.noise):
-        tracked, track = track_poses(poses, scans.times, posed, options.resolution)
-        if track.noise_std < options.resolution:
+        settled_noise = options.resolution if options.resolution > TRACKING.coarse_cells else 0.0
+        tracked, track = track_poses(poses, scans.times, posed, settled_noise)
+        if track.noise_std < settled_noise:
             return found._replace(poses=replace(tracked, matched=True))
         if poses.source == SCANS or track.stands_still:
             poses = tracked
     bounds = options.bounds or bounds_of_bulk(posed(poses), options.resolution)
     poses = match_scans(poses, scans.stamps, posed, options.resolution, options.noise_std, options.fuse.noise, bounds)
     return found._replace(poses=poses)
+
+
+def _where_scans_fit(
+    provider: PoseProvider, found: Localization, options: ReplayOptions, timer: StageTimer
+) -> Localization:
+    """Hold poses against the scans: ``auto`` takes what these fit by, and what they do not fit by is noted."""
+    poses, scans = found.poses, found.scans
+    if poses.source in (*EXACT_SOURCES, SCANS):
+        return found
+    from replay.poses.tracking.scan_fit import ScanFit, fit_windows, scan_fit  # a replay by true poses starts faster
+
+    def fits_by(by: LaserPoses) -> list[ScanFit]:
+        usable = np.flatnonzero(by.valid & (scans.scanner == 0))
+        usable = usable[np.argsort(scans.stamps[usable], kind="stable")]
+        groups = [[usable[window] for window in windows] for windows in fit_windows(len(usable))]
+        wanted = scans.only(np.unique(np.concatenate([window for group in groups for window in group])))
+        posed = {one.position: one for one in pose_scans(wanted, by, options, timer)}
+        return [
+            scan_fit([[posed[number] for number in window if number in posed] for window in group])
+            for group in groups
+        ]
+
+    fits, is_auto = fits_by(poses), options.pose == PoseSourceName.AUTO and not options.odom_topic
+    other = _odometry(provider, found, options) if is_auto and poses.source == FUSED else None
+    if other is not None:
+        others = fits_by(other)
+        worse = [pair for pair in zip(fits, others, strict=True) if pair[0].is_worse_than(pair[1])]
+        if worse and not any(b.is_worse_than(a) for a, b in zip(fits, others, strict=True)):
+            fused, by_odometry = worse[0]
+            note = (
+                f"scans do not fit each other by fused poses: {fused.given:.0%} of their points lie on the map of "
+                f"others, {by_odometry.given:.0%} by {other.origin}, which is used; to fuse give --pose fused"
+            )
+            found, poses, fits = found._replace(poses=other, notes=(*found.notes, note)), other, others
+    bad = [fit for fit in fits if fit.is_bad()]
+    if bad and is_auto and poses.source == PoseSourceName.ODOM and path_length(poses.poses[poses.valid]) == 0:
+        times = scans.times if options.deskew else scans.times.at_once()
+        note = f"{poses.origin} stands still where the scans do not: poses are found by the scans alone"
+        return _at_rest(provider, scans, times, (*found.notes, note))
+    if bad and not options.match_scans:
+        note = (
+            f"scans do not fit each other by these poses: {bad[0].given:.0%} of their points lie on the map of "
+            f"others, {bad[0].matched:.0%} once they are matched: try --match-scans"
+        )
+        found = found._replace(notes=(*found.notes, note))
+    return found
+
+
+def _odometry(provider: PoseProvider, found: Localization, options: ReplayOptions) -> LaserPoses | None:
+    """Return poses by odometry alone; None where there is none."""
+    try:
+        return provider.laser_poses(
+            found.scans.times if options.deskew else found.scans.times.at_once(), PoseSourceName.ODOM
+        )
+    except LogReadError:
+        return None
 
 
 def _drift(poses: LaserPoses, noise: SensorNoise) -> bool:

@@ -1,5 +1,6 @@
 """Small logs that were built after public bug reports, by others: each ends as its description asks."""
 
+import math
 from pathlib import Path
 from typing import Any
 
@@ -27,6 +28,7 @@ def replayed(name: str, **options: Any) -> prim.Result:
     [
         ("filezstd", None),
         ("foxglove_protobuf", None),
+        ("gps_gentle", "scans do not fit each other by fused poses: 59% of their points"),
         ("inc0", "angle_increment contradicts angle_min and angle_max in 120 scans"),
         ("msgzstd", None),
         ("multiecho", None),
@@ -46,6 +48,16 @@ def test_the_room_is_found_in_every_form(name: str, note: str | None) -> None:
     assert (square.x, square.y, square.size["side"]) == pytest.approx((1.1, 1.05, 0.25), abs=0.02)
     assert (circle.x, circle.y, circle.size["radius"]) == pytest.approx((2.9, 1.2, 0.15), abs=0.02)
     assert (note is None and not result.notes) or any(note in line for line in result.notes if note)
+
+
+def test_scans_alone_show_the_room() -> None:
+    """Where it lies on the map nobody knows; how far its things stand from each other the scans tell."""
+    result = replayed("scan_only")
+    circle, square = sorted(result.primitives, key=lambda primitive: str(primitive.kind))
+    assert (str(circle.kind), str(square.kind)) == ("circle", "square")
+    assert (square.size["side"], circle.size["radius"]) == pytest.approx((0.25, 0.15), abs=0.01)
+    assert math.hypot(circle.x - square.x, circle.y - square.y) == pytest.approx(math.hypot(1.8, 0.15), abs=0.02)
+    assert result.poses.source == "scans" and any("found by the scans alone" in note for note in result.notes)
 
 
 def test_a_split_bag_is_one_log() -> None:

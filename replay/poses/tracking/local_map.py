@@ -12,6 +12,7 @@ from replay.poses.tracking.kernels import (
     Fit,
     Grid,
     Window,
+    add_residuals,
     fit_pose,
     note_nearest,
     pool_scores,
@@ -84,6 +85,16 @@ class LocalMap:
             points, self._points, self._nearest, self._grid, self._fit, prior, information, at, own
         )
         return Match(at, own, score / max(len(points), 1), float(np.sqrt(squares / weights)) if weights > 0 else 0.0)
+
+    def score(self, points: FloatArray, pose: FloatArray) -> float:
+        """Return how well a scan's points (N, 4) fit the map at a pose (3,), from 0 to 1: :attr:`Match.score`."""
+        information, vector = np.empty((3, 3)), np.empty(3)
+        width = self._fit.kernels[-1]
+        at = pose.astype(float)
+        found = add_residuals(
+            points, at, self._points, self._nearest, self._grid, self._fit, width, information, vector
+        )
+        return float(found[0]) / max(len(points), 1)
 
     def search(
         self, points: FloatArray, middle: FloatArray, window: Window, levels: int, least: float = 0.0

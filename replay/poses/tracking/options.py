@@ -101,6 +101,12 @@ class TrackingOptions:
         block: Keyframes that share a map in these.
         surfel: Points within so much (m) of each other become one in these maps.
         settled_std: Standard deviation of the prior around a scan's pose in a round (m, rad).
+        coarse_cells: In a map with larger cells than this (m) the points of scans place these better than the map.
+        windows: The fit of scans is tested in so many windows …
+        window_scans: … of so many scans.
+        misplaced: How far poses may be off in that test (m, rad).
+        worse_fit: Of two sources one is worse where its scans' score is lower by this.
+        bad_fit: Poses are bad where scans score lower by this than once they are matched.
         least_path: Where scans move by more than this (m) …
         least_share: … and odometry by less than this share of it, it is taken to stand still.
     """
@@ -128,6 +134,12 @@ class TrackingOptions:
     block: int = 5
     surfel: float = 0.05
     settled_std: tuple[float, float] = (0.02, math.radians(0.3))
+    coarse_cells: float = 0.02
+    windows: int = 6
+    window_scans: int = 12
+    misplaced: tuple[float, float] = (0.1, 0.05)
+    worse_fit: float = 0.05
+    bad_fit: float = 0.1
     least_path: float = 0.5
     least_share: float = 0.1
 

@@ -86,6 +86,8 @@ def surfels(points: FloatArray, distance: float) -> FloatArray:
     Returns:
         (M, 4) the means of two points at least.
     """
+    if not len(points):
+        return points
     squares = np.floor(points[:, :2] / distance).astype(np.int64)
     squares -= squares.min(axis=0)
     quarter = 2 * (points[:, 2] > 0) + (points[:, 3] > 0)
