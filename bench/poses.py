@@ -1,6 +1,7 @@
 """Pose errors on driven sessions: odometry, filter, smoother, scan matching, and their effect on maps and primitives.
 
-    python -m bench.poses [fusion] [speed] [matching] [csail] [chain] [--sessions 50] [--update docs/poses.md]
+    python -m bench.poses [fusion] [speed] [matching] [halves] [relations] [csail] [chain] [--sessions 50]
+        [--update docs/poses.md]
 
 Sessions as recorded by default (60 s at 10 Hz; odometry 0.05 m and 2 degrees after a metre, GPS 0.1 m, compass 3
 degrees), driven, seeds from 0. Errors are root mean squares over a session's scans, without any alignment, then over
@@ -22,6 +23,7 @@ from functools import partial
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from bench.heldout import EVERY, frame_of, rays_of, score
 from bench.maps import update
@@ -30,9 +32,11 @@ from prim.arrays import FloatArray, Stamps
 from prim.errors import LogReadError
 from prim.log import open_log
 from prim.metrics import pose_nees, pose_rmse
-from prim.se2 import Pose2D, wrap_angles
+from prim.scan import PosedScan
+from prim.se2 import Pose2D, relative_poses, wrap_angles
 from recorder.sensors import Lidar
 from recorder.session import SessionOptions, record_session
+from replay.localization import localize
 from replay.options import ReplayOptions
 from replay.pipeline import Pipeline
 from replay.poses.fusion import Fusion
@@ -41,9 +45,11 @@ from replay.poses.fusion_options import SENSORS, FusionInputs, SensorNoise
 from replay.poses.laser_poses import FUSED, LaserPoses
 from replay.poses.pose_provider import PoseProvider
 from replay.poses.scan_matching import match_scans
+from replay.poses.tracking.scan_tracker import ScanTrack, track
 from replay.result import ReplayResult
 from replay.scans.posed_scans import PosedScanOptions, PosedScans, ScanLog
 from replay.scans.selection import Selection
+from replay.timing import StageTimer
 
 SUBSETS = {
     "odometry, GPS, compass": SENSORS,
@@ -208,44 +214,154 @@ def run_filterpy(nodes: FusionNodes) -> FloatArray:
     return last
 
 
-def matching_errors(seed: int) -> Errors:
-    """Return RMSE (m, rad), NEES and time (s) of poses with and without scan matching."""
+MATCHED = {
+    "odom": ReplayOptions(pose="odom", match_scans=True),
+    FUSED: ReplayOptions(pose=FUSED, match_scans=True),
+    "scans alone": ReplayOptions(pose="scans"),
+}
+"""Sources of poses whose scans are matched."""
+
+RANGE_NOISE = (0.02, 0.05)
+"""Of the sessions that are matched (m)."""
+
+LARGE_NOISE = 0.25
+"""Where scans alone are tried too (m)."""
+
+
+def matching_errors(job: tuple[int, float]) -> Errors:
+    """Return RMSE (m, rad), NEES and CPU time (s) of poses with and without scan matching, of a seed and a noise."""
+    seed, noise_std = job
     errors: Errors = {}
-    with tempfile.TemporaryDirectory() as folder:
-        path = driven(folder, seed)
-        with open_log(path) as log:
-            scans = ScanLog(log, Selection())
-            truth = PoseProvider(log).laser_poses(scans.times, "truth").poses
-            posed_scans = partial(PosedScans, scans)
-            for source in ("odom", FUSED):
-                poses = PoseProvider(log).laser_poses(scans.times, source)
-                start = time.perf_counter()
-                matched = match_scans(poses, scans.stamps, posed_scans, 0.01)
-                spent = time.perf_counter() - start
-                assert matched.covariances is not None
-                nees = pose_nees(matched.poses, truth, matched.covariances) or math.nan
-                errors[source] = (*pose_rmse(poses.poses, truth), math.nan, math.nan)
-                errors[f"{source}, **matched**"] = (*pose_rmse(matched.poses, truth), nees, spent)
+    with tempfile.TemporaryDirectory() as folder, open_log(driven(folder, seed, noise_std=noise_std)) as log:
+        scans = ScanLog(log, Selection())
+        truth = PoseProvider(log).laser_poses(scans.times, "truth").poses
+        for name, options in MATCHED.items():
+            if noise_std == LARGE_NOISE and name != "scans alone":
+                continue
+            if options.match_scans:
+                poses = PoseProvider(log).laser_poses(scans.times, options.pose)
+                errors[name] = (*pose_rmse(poses.poses, truth), math.nan, math.nan)
+            start = time.process_time()
+            matched = localize(scans, options, StageTimer()).poses
+            spent = time.process_time() - start
+            assert matched.covariances is not None
+            nees = pose_nees(matched.poses, truth, matched.covariances) or math.nan
+            errors[f"{name}, **matched**"] = (*pose_rmse(matched.poses, truth), nees, spent)
     return errors
 
 
 def matching_table(seeds: Sequence[int], pool: ProcessPoolExecutor) -> str:
-    sessions = list(pool.map(matching_errors, seeds))
-    raw = rms([errors["odom"][0] for errors in sessions])
     lines = [
-        "| poses | position, mm | worst | heading, ° | position / odometry's | NEES, median | time |",
-        "|---|---:|---:|---:|---:|---:|---:|",
+        "| σ, mm | poses | position, mm | median | worst | heading, ° | NEES, mean | median | CPU |",
+        "|---:|---|---:|---:|---:|---:|---:|---:|---:|",
     ]
-    for name in sessions[0]:
-        rows = np.array([errors[name] for errors in sessions])
-        metres, radians = rms(rows[:, 0].tolist()), rms(rows[:, 1].tolist())
-        consistency = "" if math.isnan(rows[0, 2]) else f"{np.median(rows[:, 2]):.1f}"
-        spent = "" if math.isnan(rows[0, 3]) else f"{np.median(rows[:, 3]):.0f} s"
+    for noise_std in (*RANGE_NOISE, LARGE_NOISE):
+        sessions = list(pool.map(matching_errors, [(seed, noise_std) for seed in seeds]))
+        for name in sessions[0]:
+            rows = np.array([errors[name] for errors in sessions])
+            metres, radians = rms(rows[:, 0].tolist()), rms(rows[:, 1].tolist())
+            nees = "| |" if math.isnan(rows[0, 2]) else f"| {rows[:, 2].mean():.1f} | {np.median(rows[:, 2]):.1f}"
+            spent = "" if math.isnan(rows[0, 3]) else f"{np.median(rows[:, 3]):.0f} s"
+            lines.append(
+                f"| {1000 * noise_std:.0f} | {name} | {1000 * metres:.1f} | {1000 * np.median(rows[:, 0]):.1f} | "
+                f"{1000 * rows[:, 0].max():.1f} | {math.degrees(radians):.2f} {nees.rstrip('|')} | {spent} |"
+            )
+    return "\n".join([*lines, "", f"{len(seeds)} sessions of 600 scans with 500 rays each."])
+
+
+LAGS = (1, 5, 20, 100, 400)
+"""Scans between the two whose motion halves of the beams are compared by."""
+
+HALVED = ("intel_raw.mcap", "csail_raw.mcap")
+
+TRACKED_CELLS = 0.05
+"""The map's cells (m) where buildings are tracked."""
+
+
+def half(posed: PosedScan, first: int) -> PosedScan:
+    """Return a scan's even beams (``first`` is 0) or its odd ones (1)."""
+    scan = posed.scan
+    turned = scan.angle_min + first * scan.angle_increment
+    ranges = np.ascontiguousarray(scan.ranges[first::2])
+    halved = replace(scan, angle_min=turned, angle_increment=2 * scan.angle_increment, ranges=ranges)
+    return replace(posed, scan=halved, pieces=[(halved, posed.pose)])
+
+
+def halves_table(folder: Path) -> str:
+    """Compare the motions that odd and even beams say with the covariances that they claim: no truth is needed."""
+    lines = [
+        "| log | poses | " + " | ".join(f"{lag} scans" for lag in LAGS) + " | all |",
+        "|---|---|" + "---:|" * (len(LAGS) + 1),
+    ]
+    for name in HALVED:
+        with open_log(folder / name) as log:
+            scans = ScanLog(log, Selection())
+            poses = replace(PoseProvider(log).laser_poses(scans.times, "odom"), end_poses=None)
+            held = list(PosedScans(scans, poses))
+        odometry = poses.poses[[posed.position for posed in held]]
+        for label, known in (("odometry", odometry), ("scans alone", None)):
+            halves = [track([half(posed, k) for posed in held], known) for k in (0, 1)]
+            differences = [motion_nees(*halves, lag) for lag in LAGS]
+            cells = " | ".join(f"{value:.1f}" for value in (*differences, np.mean(differences)))
+            lines.append(f"| {name} | {label} | {cells} |")
+    return "\n".join([*lines, "", "NEES of the differences: 3 where the covariances of both hold."])
+
+
+def motion_nees(one: ScanTrack, other: ScanTrack, lag: int) -> float:
+    """Return the mean normalised squared difference of two tracks' motions over so many scans."""
+    assert one.errors is not None and other.errors is not None
+    first = np.arange(0, len(one.poses) - lag, max(lag // 2, 1))
+    motions = [relative_poses(track.poses[first], track.poses[first + lag]) for track in (one, other)]
+    apart = motions[0] - motions[1]
+    apart[:, 2] = wrap_angles(apart[:, 2])
+    spread = one.errors.between(first, first + lag) + other.errors.between(first, first + lag)
+    return float(np.einsum("ni,nij,nj->n", apart, np.linalg.inv(spread), apart).mean())
+
+
+EXACT_STAMPS = 0.002
+"""Relations count where both of their stamps are those of scans within this (s)."""
+
+
+def relations_table(folder: Path) -> str:
+    """Score the Intel lab's poses by the relations of Kümmerle et al. (2009), on exact stamps."""
+    relations = np.loadtxt(folder / "intel.relations")
+    lines = [
+        "| intel_raw.mcap | relations | translation, m | median | rotation, ° | CPU beside mapping alone |",
+        "|---|---:|---:|---:|---:|---:|",
+    ]
+    plain = ReplayOptions(mapper="forward", pose="odom", resolution=TRACKED_CELLS, detect=False)
+    start = time.process_time()
+    Pipeline(folder / "intel_raw.mcap", plain).run()
+    alone = time.process_time() - start
+    for name, options in (
+        ("odometry", replace(plain, match_scans=True)),
+        ("scans alone", replace(plain, pose="scans")),
+    ):
+        start = time.process_time()
+        result = Pipeline(folder / "intel_raw.mcap", options).run()
+        ratio = (time.process_time() - start) / alone
+        metres, degrees = relation_errors(result.stamps, result.poses.poses, relations)
         lines.append(
-            f"| {name} | {1000 * metres:.1f} | {1000 * rows[:, 0].max():.1f} | {math.degrees(radians):.2f} | "
-            f"{metres / raw:.2f} | {consistency} | {spent} |"
+            f"| {name} | {len(metres)} | {metres.mean():.4f} ± {metres.std():.4f} | {np.median(metres):.4f} | "
+            f"{degrees.mean():.3f} ± {degrees.std():.3f} | {ratio:.2f} |"
         )
-    return "\n".join([*lines, "", f"{len(sessions)} sessions of 600 scans with 500 rays."])
+    return "\n".join(lines)
+
+
+def relation_errors(stamps: Stamps, poses: FloatArray, relations: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return the errors (m, degrees) of relations (stamps, x, y, z, roll, pitch, heading) between exact stamps."""
+    seconds = stamps / 1e9
+
+    def nearest(wanted: FloatArray) -> NDArray[np.intp]:
+        after = np.clip(np.searchsorted(seconds, wanted), 1, len(seconds) - 1)
+        return after - (wanted - seconds[after - 1] < seconds[after] - wanted)
+
+    first, last = nearest(relations[:, 0]), nearest(relations[:, 1])
+    exact = np.abs(seconds[first] - relations[:, 0]) < EXACT_STAMPS
+    exact &= np.abs(seconds[last] - relations[:, 1]) < EXACT_STAMPS
+    motions = relative_poses(poses[first[exact]], poses[last[exact]])
+    metres = np.hypot(*(motions[:, :2] - relations[exact, 2:4]).T)
+    return metres, np.degrees(np.abs(wrap_angles(motions[:, 2] - relations[exact, 7])))
 
 
 def csail_table(path: Path) -> str:
@@ -289,6 +405,7 @@ CHAINS = {
     "odom": ReplayOptions(mapper="forward", pose="odom"),
     "odom, matched": ReplayOptions(mapper="forward", pose="odom", match_scans=True),
     "fused": ReplayOptions(mapper="forward", pose=FUSED),
+    "scans alone": ReplayOptions(mapper="forward", pose="scans"),
     "fused, matched": ReplayOptions(mapper="forward", pose=FUSED, match_scans=True),
 }
 
@@ -382,11 +499,15 @@ def tables(wanted: Sequence[str], sessions: int, data: Path) -> Iterator[tuple[s
             yield "chain", chain_table(range(sessions), pool)
     if "speed" in wanted:
         yield "speed", speed_table()
+    if "halves" in wanted and all((data / name).exists() for name in HALVED):
+        yield "halves", halves_table(data)
+    if "relations" in wanted and (data / "intel.relations").exists():
+        yield "relations", relations_table(data)
     if "csail" in wanted and (data / "csail.mcap").exists():
         yield "csail", csail_table(data / "csail.mcap")
 
 
-PARTS = ("fusion", "speed", "matching", "csail", "chain")
+PARTS = ("fusion", "speed", "matching", "halves", "relations", "csail", "chain")
 
 
 def main() -> None:

@@ -267,7 +267,8 @@ def frame_covariances(covariance: FloatArray, poses: FloatArray) -> FloatArray:
     """Compute what an uncertain frame adds to the covariances of poses that are given in it.
 
     Args:
-        covariance: (3, 3) of the frame's own pose, its errors given at the frame's origin and in its axes.
+        covariance: (3, 3) of the frame's own pose, its errors given at its origin and in its axes; or (N, 3, 3),
+            one for each pose.
         poses: (N, 3) in the frame.
 
     Returns:

@@ -253,6 +253,8 @@ NOT_IN_TABLES = {
     "such as --sizes 0.05 2": "tests/replay/detection/test_visibility.py",
     "search for those that are shown with --sizes": "tests/replay/detection/test_visibility.py",
     ", or finer cells with --resolution": "tests/replay/detection/test_visibility.py",
+    "which is used; to fuse give --pose fused": "tests/replay/test_case_logs.py",
+    "once they are matched: try --match-scans": "tests/replay/poses/test_tracking.py",
     "change to another one": USERS,
     "choose another place": USERS,
     "give the output another name": USERS,

@@ -133,8 +133,8 @@ class DetectionRefiner:
 
     Args:
         noise_std: The range noise (m); None to estimate it.
-        frame_covariance: The covariance (3, 3; m, rad) of the map frame's own pose, which adds to that of each
-            primitive; None where it is exact.
+        frame_covariance_at: Returns the covariance (3, 3; m, rad) of the map frame's own pose, as it matters at a
+            place x, y (m); it adds to that of each primitive there. None where it is exact.
         moved: Refines what moves by the scans since it did; None: all is taken to stand.
         refinement: Numeric parameters of the fits.
         options: How much work goes into detection before the last scan.
@@ -143,7 +143,7 @@ class DetectionRefiner:
     def __init__(
         self,
         noise_std: float | None,
-        frame_covariance: FloatArray | None,
+        frame_covariance_at: Callable[[float, float], FloatArray | None],
         moved: MovedPrimitives | None = None,
         refinement: RefinementOptions = DEFAULTS,
         options: IntermediateOptions = INTERMEDIATE,
@@ -154,7 +154,7 @@ class DetectionRefiner:
         self._refinement = refinement
         self._options = options
         self._noise_std = noise_std
-        self._frame_covariance = frame_covariance
+        self._frame_covariance_at = frame_covariance_at
         self._previous: tuple[Detections, float | None] | None = None
         self._kind_search_at = 0
 
@@ -262,14 +262,18 @@ class DetectionRefiner:
 
     def _with_frame_uncertainty(self, detections: Detections) -> Detections:
         """Add the uncertainty of the map frame's pose to that of the detections."""
-        if self._frame_covariance is None:
-            return detections
-        found = tuple(
-            add_frame_uncertainty(detection, self._frame_covariance) if detection.std else detection
-            for detection in detections.found
-        )
-        objects = tuple(_in_uncertain_frame(thing, self._frame_covariance) for thing in detections.objects)
-        return replace(detections, found=found, objects=objects)
+        found, objects = [], []
+        for detection in detections.found:
+            covariance = self._frame_covariance_at(detection.primitive.x, detection.primitive.y)
+            if covariance is not None and detection.std:
+                found.append(add_frame_uncertainty(detection, covariance))
+            else:
+                found.append(detection)
+        for thing in detections.objects:
+            x, y = thing.outline.mean(axis=0).tolist()
+            covariance = self._frame_covariance_at(x, y)
+            objects.append(thing if covariance is None else _in_uncertain_frame(thing, covariance))
+        return replace(detections, found=tuple(found), objects=tuple(objects))
 
 
 def add_frame_uncertainty(detection: Detection, frame_covariance: FloatArray) -> Detection:

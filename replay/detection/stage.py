@@ -128,7 +128,7 @@ class DetectionStage:
         poses, moved = self._posed_scans.poses, None
         if self.streaming and poses.max_std is not None:
             moved = _moved_primitives(self._detector, options, frame, poses.max_std)
-        return DetectionRefiner(options.noise_std, poses.frame_covariance, moved, options.refinement)
+        return DetectionRefiner(options.noise_std, poses.frame_covariance_at, moved, options.refinement)
 
     @property
     def streaming(self) -> bool:

@@ -173,6 +173,26 @@ class LaserPoses:
             return None
         return math.sqrt(x + y), math.sqrt(theta)
 
+    def frame_covariance_at(self, x: float, y: float) -> FloatArray | None:
+        """Return the covariance of the map at a place: of its frame's motion there.
+
+        Args:
+            x: M.
+            y: M.
+
+        Returns:
+            (3, 3) of the frame's x, y (m) and heading (rad), at its origin: that of the whole map where it is one
+            piece, else, where poses are tracked along the way, by the laser's pose that is nearest. None where it is
+            not known.
+        """
+        if self.frame_covariance is not None or self.covariances is None or not self.matched:
+            return self.frame_covariance
+        away = np.where(self.valid, np.hypot(self.poses[:, 0] - x, self.poses[:, 1] - y), np.inf)
+        nearest = int(np.argmin(away))
+        px, py, _ = self.poses[nearest].tolist()
+        back = np.array([[1.0, 0.0, py], [0.0, 1.0, -px], [0.0, 0.0, 1.0]])
+        return np.asarray(back @ self.covariances[nearest] @ back.T)
+
     def at(self, position: int) -> Pose2D:
         """Return the pose of the scan at this index, with its covariance where that is known."""
         covariance = None if self.covariances is None else self.covariances[position]

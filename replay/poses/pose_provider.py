@@ -22,7 +22,7 @@ from replay.poses.fusion_options import COMPASS, GPS, ODOM, FusionInputs, Fusion
 from replay.poses.laser_poses import FUSED, STILL, FusedSensor, LaserPoses, ScanTimes
 from replay.poses.mount import SensorMounts, assumed_note
 from replay.poses.sensors import (
-    REST_HINT,
+    SCANS_HINT,
     SensorLogs,
     compass_headings,
     find_compass,
@@ -205,7 +205,7 @@ class PoseProvider:
                     [
                         *self._mounts.tree_notes,
                         *self._log.lost,
-                        REST_HINT,
+                        SCANS_HINT,
                     ]
                 ),
             )

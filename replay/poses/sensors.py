@@ -23,6 +23,7 @@ from replay.poses.transforms import is_valid_pose
 GPS_CONTENTS = (Content.POINT, Content.FIX)
 COMPASS_CONTENTS = (Content.VECTOR,)
 REST_HINT = "to map with the robot at rest give --standing-still"
+SCANS_HINT = "find them by the scans alone: --pose scans"
 """What helps where there are no poses."""
 
 POSE_CONTENTS = (Content.ODOMETRY, Content.POSE)

@@ -257,6 +257,17 @@ def only(*arguments: str, topics: Topics = PLAIN) -> Callable[[], list[str]]:
     return lambda: [write("a.mcap", topics), *arguments]
 
 
+def poses_that_are_not_numbers() -> list[str]:
+    with LogWriter(Path("a.mcap")) as log:
+        log.add_topic("/scan", SCAN_TYPE)
+        log.add_topic("/odom", ODOMETRY_TYPE)
+        for second in range(1, 4):
+            stamp = second * SECOND
+            log.write("/scan", stamp, encode_scan(replace(SCAN, stamp=stamp)))
+            log.write("/odom", stamp, encode_odometry(stamp, Pose2D(math.nan, 0, 0)))
+    return ["a.mcap"]
+
+
 def poses_far_away() -> list[str]:
     with LogWriter(Path("a.mcap")) as log:
         log.add_topic("/scan", SCAN_TYPE)
@@ -418,7 +429,8 @@ SITUATIONS = {
         listed("--gps-topic", "topics with such messages: "),
     ),
     "no scan is selected": Situation(only("--start", "99"), "begin with the first one"),
-    "no poses": Situation(only(topics=Topics(odometry=())), "to map with the robot at rest"),
+    "no poses": Situation(only("--pose", "odom", topics=Topics(odometry=())), "find them by the scans alone"),
+    "no usable poses": Situation(poses_that_are_not_numbers, "to map with the robot at rest"),
     "no truth": Situation(only("--pose", "truth"), "take what poses there are"),
     "no chain in tf": Situation(only("--pose", "tf"), "take what poses there are"),
     "nothing to fuse": Situation(

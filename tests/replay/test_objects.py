@@ -413,7 +413,7 @@ def test_the_frame_of_the_map_adds_to_the_uncertainty_of_an_outline(monkeypatch:
     """Its place as much as its turn, which counts by the distance from the frame's origin."""
 
     def std_of(thing: UnknownObject, *variances: float) -> float:
-        refiner = DetectionRefiner(None, np.diag(variances))
+        refiner = DetectionRefiner(None, lambda x, y: np.diag(variances))
         refiner._refine = lambda *arguments: (Detections((), (), objects=(thing,)), None)  # type: ignore[method-assign]
         detections, _ = refiner.refine(Detections((), ()), grid, list)
         return detections.objects[0].std

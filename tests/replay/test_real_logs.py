@@ -130,8 +130,16 @@ def test_two_scanners_without_poses_are_refused(real_log: Find, failing: Callabl
     path = real_log("hokuyo_two_scanners.mcap")
     both_topics = failing(path)
     assert "/front_scan, /rear_scan" in both_topics and "--scan-topic" in both_topics
-    assert "--standing-still" in failing(path, "--scan-topic", "/front_scan")
+    assert "--pose scans" in failing(path, "--scan-topic", "/front_scan", "--pose", "odom")
     assert "its scan topics: /front_scan, /rear_scan" in failing(path, "--scan-topic", "/scan")
+
+
+def test_a_scanner_without_poses_is_tracked(real_log: Find) -> None:
+    """It stands still, which its scans say."""
+    options = ReplayOptions(scan_topic=("/front_scan",), resolution=0.05, detect=False)
+    result = Pipeline(real_log("hokuyo_two_scanners.mcap"), options).run()
+    assert result.poses.source == "scans"
+    assert np.abs(result.poses.poses[:, :2]).max() < 0.05 and np.abs(result.poses.poses[:, 2]).max() < 0.01
 
 
 @every

@@ -73,7 +73,19 @@ def _tracked(
     ends = compose_poses(places[count:], mounts) if poses.end_poses is not None else None
     several = mounts if len(times.frame_ids) > 1 else poses.mounts
     valid = poses.valid & within[:count]
-    return replace(poses, poses=whole, end_poses=ends, valid=valid, mounts=several), found
+    placed = replace(poses, poses=whole, end_poses=ends, valid=valid, mounts=several)
+    if found.errors is not None:
+        turn = _turned_by(lasers[0, 2])
+        nearest = np.clip(np.searchsorted(times.stamps[at], times.stamps), 0, len(at) - 1)
+        placed = replace(placed, covariances=(turn @ found.errors.since_first() @ turn.T)[nearest])
+    return placed, found
+
+
+def _turned_by(angle: float) -> FloatArray:
+    """Return the matrix (3, 3) that turns errors of poses (x, y, heading) by an angle (rad)."""
+    turn = np.eye(3)
+    turn[:2, :2] = [[math.cos(angle), -math.sin(angle)], [math.sin(angle), math.cos(angle)]]
+    return turn
 
 
 def _mounts_of(poses: LaserPoses) -> FloatArray:
@@ -105,8 +117,8 @@ def track_notes(found: ScanTrack, odometry: LaserPoses | None, times: ScanTimes)
             seconds = (int(stamps[0]) - int(begin)) / 1e9
             what = "scan" if len(found.overruled) == 1 else "scans"
             notes.append(
-                f"{odometry.origin} jumps at {len(found.overruled)} {what} of {count}, first at {seconds:.1f} s: "
-                "the scans are followed there"
+                f"{odometry.origin} is off by more than is plausible at {len(found.overruled)} {what} of {count}, "
+                f"first at {seconds:.1f} s: the scans are followed there"
             )
     if found.broken:
         what = "scan fits" if len(found.broken) == 1 else "scans fit"

@@ -87,7 +87,15 @@ class LocalMap:
         return Match(at, own, score / max(len(points), 1), float(np.sqrt(squares / weights)) if weights > 0 else 0.0)
 
     def score(self, points: FloatArray, pose: FloatArray) -> float:
-        """Return how well a scan's points (N, 4) fit the map at a pose (3,), from 0 to 1: :attr:`Match.score`."""
+        """Measure how well a scan fits the map.
+
+        Args:
+            points: (N, 4) of the scan.
+            pose: (3,).
+
+        Returns:
+            From 0 to 1, as :attr:`Match.score`.
+        """
         information, vector = np.empty((3, 3)), np.empty(3)
         width = self._fit.kernels[-1]
         at = pose.astype(float)
@@ -128,5 +136,12 @@ class LocalMap:
 
 
 def joined(scans: Sequence[FloatArray]) -> FloatArray:
-    """Return the points (N, 4) of several scans as one array."""
+    """Join the points of several scans.
+
+    Args:
+        scans: Points (N, 4) of each.
+
+    Returns:
+        All of them as one array.
+    """
     return np.concatenate(scans) if scans else np.zeros((0, 4))

@@ -101,6 +101,9 @@ class TrackingOptions:
         block: Keyframes that share a map in these.
         surfel: Points within so much (m) of each other become one in these maps.
         settled_std: Standard deviation of the prior around a scan's pose in a round (m, rad).
+        least_std: Standard deviations of a match (m, rad) beside those that its residuals have: what a map of few
+            scans has of its own; by halves of the beams of two buildings (bench/poses.py).
+        first_std: Those of the first pose, which is known.
         coarse_cells: In a map with larger cells than this (m) the points of scans place these better than the map.
         windows: The fit of scans is tested in so many windows …
         window_scans: … of so many scans.
@@ -130,10 +133,12 @@ class TrackingOptions:
     broken: float = 0.5
     wide_window: tuple[float, float] = (1.0, math.radians(60))
     widest: float = 6.0
-    settled_rounds: int = 3
+    settled_rounds: int = 2
     block: int = 5
     surfel: float = 0.05
     settled_std: tuple[float, float] = (0.02, math.radians(0.3))
+    least_std: tuple[float, float] = (0.0015, math.radians(0.06))
+    first_std: float = 1e-5
     coarse_cells: float = 0.02
     windows: int = 6
     window_scans: int = 12

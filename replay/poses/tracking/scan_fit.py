@@ -32,11 +32,26 @@ class ScanFit(NamedTuple):
     scans: int
 
     def is_worse_than(self, other: ScanFit, options: TrackingOptions = DEFAULTS) -> bool:
-        """Tell whether scans fit clearly worse by these poses than by others."""
+        """Tell whether scans fit clearly worse by these poses than by others.
+
+        Args:
+            other: The fit of the same scans by the others.
+            options: What is clear.
+
+        Returns:
+            Whether they do; not where there are no scans.
+        """
         return bool(self.scans and other.scans and self.given < other.given - options.worse_fit)
 
     def is_bad(self, options: TrackingOptions = DEFAULTS) -> bool:
-        """Tell whether scans fit clearly worse than they could."""
+        """Tell whether scans fit clearly worse than they could.
+
+        Args:
+            options: What is clear.
+
+        Returns:
+            Whether they do; not where there are no scans.
+        """
         return bool(self.scans and self.given < self.matched - options.bad_fit)
 
 

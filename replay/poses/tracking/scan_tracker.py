@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapping.range_noise import neighbour_noise
+from prim import linear_algebra
 from prim.arrays import FloatArray, Stamps
 from prim.scan import PosedScan
 from prim.se2 import compose_poses, path_length, relative_poses, wrap_angles
@@ -23,6 +24,7 @@ from replay.poses.tracking.kernels import Window
 from replay.poses.tracking.local_map import LocalMap, Match, joined
 from replay.poses.tracking.options import DEFAULTS, TrackingOptions
 from replay.poses.tracking.points import moved, scan_points, surfels, thinned
+from replay.poses.tracking.track_errors import TrackErrors
 
 
 @dataclass(frozen=True)
@@ -37,6 +39,7 @@ class ScanTrack:
         broken: Indices of the scans that fit nowhere: a new map begins there, and what lies between is a guess.
         noise_std: The range noise (m).
         stands_still: Whether odometry stands still where the scans move.
+        errors: What is unsure about the poses; None where scans were not matched anew in the end.
     """
 
     poses: FloatArray
@@ -46,6 +49,7 @@ class ScanTrack:
     broken: tuple[int, ...]
     noise_std: float
     stands_still: bool = False
+    errors: TrackErrors | None = None
 
 
 def track(
@@ -81,6 +85,7 @@ def track(
         tuple(tracker.broken),
         noise_std,
         odometry is not None and _stands_still(odometry, tracker.poses, options),
+        tracker.errors() if noise_std < settled_noise else None,
     )
 
 
@@ -149,6 +154,7 @@ class ScanTracker:
     def __post_init__(self) -> None:
         count, places = len(self.points), self.options.points
         self.poses, self.scores = np.zeros((count, 3)), np.ones(count)
+        self._matches: dict[int, Match] = {}
         self._coarse = [thinned(points, places.coarse) for points in self.points]
         self._fine = [thinned(points, places.fine) for points in self.points]
 
@@ -192,6 +198,24 @@ class ScanTracker:
             if len(self.points[number]):
                 match = local.match(self.points[number], self.poses[number], None, prior)
                 settled[number], self.scores[number] = match.pose, match.score
+                self._matches[number] = match
+
+    def _covariance(self, match: Match) -> FloatArray:
+        """Return the covariance (3, 3) of a match within its map: that of residuals, and what these do not show."""
+        options = self.options
+        residual = max(match.spread, options.points.least_noise)
+        place, turn = options.least_std
+        information = match.information * (options.map.residual / residual) ** 2 + np.eye(3) / options.widest**2
+        covariance = linear_algebra.inverse(information)
+        least = np.diag([place**2, place**2, turn**2])
+        return least if covariance is None else covariance + least
+
+    def errors(self) -> TrackErrors:
+        """Return what is unsure about the settled poses."""
+        options, covariances = self.options, np.zeros((len(self.points), 3, 3))
+        for number, match in self._matches.items():
+            covariances[number] = self._covariance(match)
+        return TrackErrors.of(self.poses, covariances, self.keyframes, self.broken, options.widest, options.first_std)
 
     def _seen_from_first(self, poses: FloatArray) -> FloatArray:
         """Return poses in the frame of the first one."""

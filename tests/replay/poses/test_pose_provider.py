@@ -169,7 +169,7 @@ def test_poses_on_another_clock_are_an_error(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("source", "message"),
     [
-        ("auto", "--standing-still"),
+        ("auto", "--pose scans"),
         ("truth", "no ground truth"),
         ("tf", "no chain from 'laser'"),
         ("odom", "no poses"),
