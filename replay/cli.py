@@ -99,7 +99,7 @@ def replay(
         ),
     ] = None,
     match_scans: Annotated[
-        bool, typer.Option("--match-scans", help="Correct the poses by scan matching, with a map of all scans.")
+        bool, typer.Option("--match-scans", help="Correct the poses by matching the scans with each other.")
     ] = False,
     no_deskew: Annotated[
         bool, typer.Option("--no-deskew", help="Treat all beams of a scan as measured at its stamp.")
