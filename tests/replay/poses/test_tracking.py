@@ -17,10 +17,11 @@ from prim.log.messages import ODOMETRY_TYPE, SCAN_TYPE, encode_odometry, encode_
 from prim.log.writer import LogWriter
 from prim.metrics import pose_rmse
 from prim.scan import PosedScan, Scan
-from prim.se2 import Pose2D, compose_poses, relative_poses, wrap_angles
+from prim.se2 import Pose2D, compose_poses, frame_covariances, relative_poses, wrap_angles
 from prim.shapes import Kind, Primitive
 from prim.world import World
 from recorder.sensors import Lidar
+from recorder.session import SessionOptions, record_session
 from replay.options import ReplayOptions
 from replay.pipeline import Pipeline
 from replay.poses.tracking.kernels import FULL_SCORE, Window
@@ -29,6 +30,7 @@ from replay.poses.tracking.options import DEFAULTS
 from replay.poses.tracking.points import moved, scan_points, surfels, thinned
 from replay.poses.tracking.scan_fit import fit_windows, scan_fit
 from replay.poses.tracking.scan_tracker import ScanTracker, track
+from replay.poses.tracking.track_errors import TrackErrors
 from replay.result import ReplayResult
 
 SECOND = 10**9
@@ -275,8 +277,6 @@ def test_odometry_alone_that_stands_still_is_left_by_auto(tmp_path: Path) -> Non
 
 
 def test_the_frame_is_that_of_the_first_true_pose(tmp_path: Path) -> None:
-    from recorder.session import SessionOptions, record_session
-
     path = tmp_path / "a.mcap"
     lidar = Lidar(rays=240, noise_std=0.01)
     record_session(path, SessionOptions(seed=5, motion="drive", duration=10.0, rate=8.0, lidar=lidar))
@@ -289,3 +289,50 @@ def test_headings_are_within_a_turn(tmp_path: Path) -> None:
     poses, _ = replayed(write(tmp_path / "a.mcap", truth))
     assert np.abs(poses[:, 2]).max() <= math.pi
     assert np.abs(wrap_angles(np.diff(poses[:, 2]))).max() < 0.3
+
+
+def test_errors_of_tracks_are_those_of_a_random_walk() -> None:
+    """Steps along x whose headings are unsure: a keyframe's turns what follows, a scan's own is its own."""
+    poses = np.column_stack((np.arange(5.0), np.zeros(5), np.zeros(5)))
+    own = np.repeat(np.diag([1e-4, 4e-4, 1e-6])[None], 5, axis=0)
+    errors = TrackErrors.of(poses, own, keyframes=(0, 2), breaks=(), break_std=6.0, first_std=1e-5)
+    since = errors.since_first()
+    assert np.diag(since[0]) == pytest.approx([1e-10] * 3)
+    # at x = 4 m: its own, the first one's turned by 4 m, and the keyframe's at 2 m turned by 2 m
+    assert since[4, 1, 1] == pytest.approx(4e-4 + (4e-4 + 16e-6) + (4e-4 + 4e-6), rel=1e-4)
+    assert since[4, 2, 2] == pytest.approx(3e-6, rel=1e-3) and since[4, 1, 2] == pytest.approx(4e-6 + 2e-6, rel=1e-3)
+    between = errors.between(np.array([0, 3, 1]), np.array([4, 4, 2]))
+    assert between[0] == pytest.approx(since[4], abs=1e-9)
+    assert between[1, 1, 1] == pytest.approx(4e-4 + 4e-4 + 1e-6), "nothing is a keyframe on the way"
+    assert between[2, 0, 0] == pytest.approx(3e-4)
+    turned = TrackErrors.of(
+        np.column_stack((np.zeros(5), np.arange(5.0), np.full(5, math.pi / 2))),
+        own[:, [1, 0, 2]][:, :, [1, 0, 2]],
+        (0, 2),
+        (),
+        6.0,
+        1e-5,
+    )
+    assert turned.between(np.array([0]), np.array([4]))[0] == pytest.approx(between[0], abs=1e-12)
+    lost = TrackErrors.of(poses, own, (0, 2), (3,), 6.0, 1e-5).since_first()
+    assert lost[2] == pytest.approx(since[2]) and lost[3, 0, 0] > 36 and lost[4, 2, 2] > 36
+
+
+def test_tracked_poses_and_what_is_seen_from_them_are_as_unsure_as_they_are_off(tmp_path: Path) -> None:
+    values, places = [], []
+    for seed in range(3):
+        path = tmp_path / f"{seed}.mcap"
+        session = SessionOptions(
+            seed=seed, motion="drive", duration=20.0, rate=8.0, lidar=Lidar(rays=300, noise_std=0.01)
+        )
+        record_session(path, session)
+        _, result = replayed(path, pose="odom", match_scans=True)
+        poses = result.poses
+        assert poses.frame_covariance is None and poses.covariances is not None
+        values.append(result.pose_nees)
+        last = poses.frame_covariance_at(*poses.poses[-1, :2].tolist())
+        assert last is not None
+        places.append(frame_covariances(last, poses.poses[-1:])[0])
+        assert places[-1] == pytest.approx(poses.covariances[-1], rel=1e-6)
+    assert 0.05 < np.median(values) < 6, "wide in a room that is seen again and again, never narrow"
+    assert 1e-3 < math.sqrt(np.mean([place[0, 0] for place in places])) < 0.05
