@@ -109,7 +109,7 @@ def _matched(found: Localization, options: ReplayOptions, timer: StageTimer) -> 
         tracked, track = track_poses(poses, scans.times, posed, settled_noise)
         if track.noise_std < settled_noise:
             return found._replace(poses=replace(tracked, matched=True))
-        if poses.source == SCANS or track.stands_still:
+        if poses.source == SCANS or track.overrules:
             poses = tracked
     bounds = options.bounds or bounds_of_bulk(posed(poses), options.resolution)
     poses = match_scans(poses, scans.stamps, posed, options.resolution, options.noise_std, options.fuse.noise, bounds)

@@ -110,6 +110,8 @@ class TrackingOptions:
         misplaced: How far poses may be off in that test (m, rad).
         worse_fit: Of two sources one is worse where its scans' score is lower by this.
         bad_fit: Poses are bad where scans score lower by this than once they are matched.
+        overruled_share: Odometry that is not followed at more than this share of scans is not relied upon …
+        sure_score: … where scans have a median score above this.
         least_path: Where scans move by more than this (m) …
         least_share: … and odometry by less than this share of it, it is taken to stand still.
     """
@@ -145,6 +147,8 @@ class TrackingOptions:
     misplaced: tuple[float, float] = (0.1, 0.05)
     worse_fit: float = 0.05
     bad_fit: float = 0.1
+    overruled_share: float = 0.05
+    sure_score: float = 0.8
     least_path: float = 0.5
     least_share: float = 0.1
 

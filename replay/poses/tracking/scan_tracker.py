@@ -39,6 +39,8 @@ class ScanTrack:
         broken: Indices of the scans that fit nowhere: a new map begins there, and what lies between is a guess.
         noise_std: The range noise (m).
         stands_still: Whether odometry stands still where the scans move.
+        overrules: Whether these poses are better than the odometry's: that stands still, or was often not followed,
+            and scans fit well.
         errors: What is unsure about the poses; None where scans were not matched anew in the end.
     """
 
@@ -49,6 +51,7 @@ class ScanTrack:
     broken: tuple[int, ...]
     noise_std: float
     stands_still: bool = False
+    overrules: bool = False
     errors: TrackErrors | None = None
 
 
@@ -77,6 +80,9 @@ def track(
     tracker.run()
     if noise_std < settled_noise:
         tracker.settle()
+    stands_still = odometry is not None and _stands_still(odometry, tracker.poses, options)
+    is_wrong = stands_still or len(tracker.overruled) > options.overruled_share * len(scans)
+    fits = not tracker.broken and float(np.median(tracker.scores)) > options.sure_score
     return ScanTrack(
         tracker.poses,
         tracker.scores,
@@ -84,7 +90,8 @@ def track(
         tuple(tracker.overruled),
         tuple(tracker.broken),
         noise_std,
-        odometry is not None and _stands_still(odometry, tracker.poses, options),
+        stands_still,
+        is_wrong and fits,
         tracker.errors() if noise_std < settled_noise else None,
     )
 

@@ -181,7 +181,7 @@ def test_all_scans_are_matched_anew_in_the_end_where_the_noise_is_low() -> None:
 def test_odometry_that_stands_still_is_not_followed() -> None:
     truth = driven()
     found = track([at_origin(one) for one in scans_at(truth)], np.zeros_like(truth))
-    assert found.stands_still
+    assert found.stands_still and found.overrules
     assert errors(found.poses, truth)[0] < 0.03
 
 
@@ -190,8 +190,17 @@ def test_odometry_that_jumps_is_not_followed_there() -> None:
     odometry = truth.copy()
     odometry[40:] = compose_poses(np.repeat([[0.6, -0.4, 1.2]], 40, axis=0), truth[40:])
     found = track([at_origin(one) for one in scans_at(truth)], odometry)
-    assert found.overruled == (40,) and not found.broken
+    assert found.overruled == (40,) and not found.broken and not found.overrules
     assert errors(found.poses, truth)[0] < 0.03
+
+
+def test_odometry_that_jumps_all_the_time_is_replaced(tmp_path: Path) -> None:
+    """Even where scans are matched with the forward map, which begins with the odometry else."""
+    truth = driven(40)
+    odometry = truth + np.where(np.arange(40) % 2, 20.0, 0.0)[:, None] * (1, 0, 0)
+    path = write(tmp_path / "a.mcap", truth, odometry)
+    options = ReplayOptions(resolution=0.02, detect=False, pose="odom", match_scans=True)
+    assert pose_rmse(Pipeline(path, options).run().poses.poses, truth)[0] < 0.02
 
 
 def test_a_robot_that_is_carried_away_is_said_to_be_lost() -> None:
