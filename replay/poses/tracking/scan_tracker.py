@@ -13,7 +13,6 @@ from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mapping.range_noise import neighbour_noise
 from prim import linear_algebra
@@ -180,21 +179,21 @@ class ScanTracker:
 
     def settle(self) -> None:
         """Match all scans anew with the keyframes before and after them, some times."""
+        starts = [0, *(self.keyframes.index(number) for number in self.broken)]
+        pieces = list(zip(starts, [*starts[1:], len(self.keyframes)], strict=True))  # what is lost begins anew
         for _ in range(self.options.settled_rounds):
             settled = self.poses.copy()
-            for first in range(0, len(self.keyframes), self.options.block):
-                self._settle_block(first, settled)
+            for start, stop in pieces:
+                for first in range(start, stop, self.options.block):
+                    self._settle_block(first, range(start, stop), settled)
             self.poses = self._seen_from_first(settled)
 
-    def _settle_block(self, first: int, settled: FloatArray) -> None:
-        """Match the scans that follow some keyframes with a map of these and of those around them."""
+    def _settle_block(self, first: int, piece: range, settled: FloatArray) -> None:
+        """Match the scans that follow some keyframes with a map of these and of those around them in their piece."""
         options, frames = self.options, self.keyframes
-        after = min(first + options.block, len(frames))
-        around = frames[max(first - options.keyframes, 0) : after + options.keyframes]
-        breaks = np.array(self.broken, dtype=np.intp)
+        after = min(first + options.block, piece.stop)
+        around = frames[max(first - options.keyframes, piece.start) : min(after + options.keyframes, piece.stop)]
         begin, end = frames[first], frames[after] if after < len(frames) else len(self.points)
-        segment = np.searchsorted(breaks, around, side="right")
-        around = [one for one, of in zip(around, segment, strict=True) if of in set(_segments_of(breaks, begin, end))]
         points = surfels(joined([moved(self._fine[one], self.poses[one]) for one in around]), options.surfel)
         if not len(points):
             return
@@ -331,10 +330,3 @@ class ScanTracker:
         apart = relative_poses(self.poses[last : last + 1], self.poses[number : number + 1])[0]
         turn = abs(wrap_angles(apart[2:])[0])
         return bool(math.hypot(*apart[:2]) > self.options.keyframe_distance or turn > self.options.keyframe_turn)
-
-
-def _segments_of(breaks: NDArray[np.intp], begin: int, end: int) -> range:
-    """Return the numbers of the segments between breaks that scans from ``begin`` up to ``end`` lie in."""
-    return range(
-        int(np.searchsorted(breaks, begin, side="right")), int(np.searchsorted(breaks, end - 1, side="right")) + 1
-    )

@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -216,9 +217,22 @@ def test_a_robot_that_is_carried_away_is_said_to_be_lost() -> None:
     )
     tracker.run()
     assert tracker.broken and tracker.broken[0] in (30, 31)
-    before = tracker.poses.copy()
     tracker.settle()
-    assert np.abs(tracker.poses[:30] - before[:30]).max() < 0.1, "what is before is not matched with what is after"
+    first = tracker.broken[0]
+    alone = ScanTracker(tracker.points[:first], np.arange(first, dtype=np.int64) * SECOND // 10, None)
+    alone.run()
+    alone.settle()
+    assert tracker.poses[:first] == pytest.approx(alone.poses, abs=1e-9), "nothing is matched with what is after"
+
+
+def test_constant_velocity_helps_where_odometry_jumps() -> None:
+    """Without a search further away, which finds the place as well."""
+    truth = driven()
+    odometry = truth.copy()
+    odometry[40:] = compose_poses(np.repeat([[0.9, -0.6, 1.6]], 40, axis=0), truth[40:])
+    near = replace(DEFAULTS, lost=0.0, broken=0.0)
+    found = track([at_origin(one) for one in scans_at(truth)], odometry, options=near)
+    assert found.overruled == (40,) and errors(found.poses, truth)[0] < 0.03
 
 
 def test_scans_tell_by_which_poses_they_fit() -> None:
