@@ -113,6 +113,12 @@ def _matched(found: Localization, options: ReplayOptions, timer: StageTimer) -> 
             poses = tracked
     bounds = options.bounds or bounds_of_bulk(posed(poses), options.resolution)
     poses = match_scans(poses, scans.stamps, posed, options.resolution, options.noise_std, options.fuse.noise, bounds)
+    if poses.source == SCANS and not track.fits:
+        note = (
+            f"scans fit each other badly ({np.median(track.scores):.0%} of their points lie on the map of those "
+            "before): poses by the scans alone may be far off, and how far is not known"
+        )
+        poses = replace(poses, covariances=None, frame_covariance=None, notes=(*poses.notes, note))
     return found._replace(poses=poses)
 
 

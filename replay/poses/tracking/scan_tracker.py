@@ -38,6 +38,7 @@ class ScanTrack:
         broken: Indices of the scans that fit nowhere: a new map begins there, and what lies between is a guess.
         noise_std: The range noise (m).
         stands_still: Whether odometry stands still where the scans move.
+        fits: Whether scans fit well, and none is lost.
         overrules: Whether these poses are better than the odometry's: that stands still, or was often not followed,
             and scans fit well.
         errors: What is unsure about the poses; None where scans were not matched anew in the end.
@@ -50,6 +51,7 @@ class ScanTrack:
     broken: tuple[int, ...]
     noise_std: float
     stands_still: bool = False
+    fits: bool = True
     overrules: bool = False
     errors: TrackErrors | None = None
 
@@ -90,6 +92,7 @@ def track(
         tuple(tracker.broken),
         noise_std,
         stands_still,
+        fits,
         is_wrong and fits,
         tracker.errors() if noise_std < settled_noise else None,
     )

@@ -257,13 +257,13 @@ def test_scans_tell_by_which_poses_they_fit() -> None:
     assert far[0] == range(0, 156, 13) and far[-1][-1] >= 900
 
 
-def write(path: Path, truth: FloatArray, odometry: FloatArray | None = None) -> Path:
+def write(path: Path, truth: FloatArray, odometry: FloatArray | None = None, noise_std: float = 0.01) -> Path:
     """Write a log of scans at poses, with odometry as it is given."""
     with LogWriter(path) as log:
         log.add_topic("/scan", SCAN_TYPE)
         if odometry is not None:
             log.add_topic("/odom", ODOMETRY_TYPE)
-        for k, posed in enumerate(scans_at(truth)):
+        for k, posed in enumerate(scans_at(truth, noise_std)):
             stamp = posed.scan.stamp
             if odometry is not None:
                 log.write("/odom", stamp, encode_odometry(stamp, Pose2D(*odometry[k].tolist())))
@@ -284,6 +284,13 @@ def test_a_log_of_scans_alone_is_replayed(tmp_path: Path, pose: str) -> None:
     assert result.poses.source == "scans" and result.poses.matched
     noted = any("they are found by the scans alone" in note for note in result.notes)
     assert noted == (pose == "auto")
+
+
+def test_where_scans_say_too_little_nothing_is_claimed(tmp_path: Path) -> None:
+    truth = driven(25)
+    _, result = replayed(write(tmp_path / "a.mcap", truth, noise_std=0.3))
+    assert result.poses.covariances is None and result.poses.frame_covariance_at(0.0, 0.0) is None
+    assert any("how far is not known" in note for note in result.notes)
 
 
 def test_odometry_alone_that_stands_still_is_left_by_auto(tmp_path: Path) -> None:
