@@ -46,7 +46,7 @@ class Fit(NamedTuple):
 
     Attributes:
         kernels: Widths (m) of Welsch's function, of each step and of what is evaluated at the end.
-        residual: Standard deviation (m) that residuals are weighed by.
+        residual: Standard deviation (m) that residuals count by.
         min_cosine: Least cosine between normals of corresponding points.
         point_weight: Weight of points on no line.
     """

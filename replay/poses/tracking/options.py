@@ -53,7 +53,7 @@ class LocalMapOptions:
         steps: Gauss and Newton's steps.
         min_cosine: Points correspond where the cosine between their normals is no less.
         point_weight: Weight of points without a line, beside those on one.
-        residual: Standard deviation of residuals (m) that a prior is weighed against.
+        residual: Standard deviation of residuals (m) beside which a prior counts.
     """
 
     cell: float = 0.05
