@@ -58,7 +58,7 @@ class LaserTrajectory:
         stamps: Their stamps (N,) in ns.
         poses: (N, 3) x, y (m), heading (rad) in the map frame.
         covariances: The poses' covariances (N, 3, 3; m, rad); None where they are not known.
-        source: Where the poses come from: «truth», «tf», «odom», «fused» or «still».
+        source: Where the poses come from: «truth», «tf», «odom», «fused», «scans» or «still».
         matched: Whether they were corrected by scan matching.
     """
 

@@ -15,7 +15,7 @@ from prim.errors import LogReadError
 from prim.log import open_log
 from prim.log.decoding.codecs import Content
 from prim.log.source import LogSource, Topic
-from replay.localization import localize
+from replay.localization import choose_poses
 from replay.options import ReplayOptions
 from replay.poses.transforms import TransformTree
 from replay.scans.scan_log import ScanLog
@@ -224,18 +224,23 @@ def _choices(log: LogSource, options: ReplayOptions) -> tuple[Choice, Choice, tu
         else kinds
     )
     try:
-        found = localize(scans, options, StageTimer())
+        found = choose_poses(scans, options, StageTimer())
     except LogReadError as error:
         return Choice(scans.names, why), Choice(None, _reason(error)), tuple(scans.notes())
     notes = (*found.notes, *found.poses.notes, *scans.notes())
-    return Choice(scans.names, why), Choice(found.poses.origin, _WHY[found.poses.source]), tuple(dict.fromkeys(notes))
+    return (
+        Choice(scans.names, why),
+        Choice(found.poses.origin, SOURCES[found.poses.source]),
+        tuple(dict.fromkeys(notes)),
+    )
 
 
-_WHY = {
+SOURCES = {
     "truth": "the ground truth",
     "tf": "a chain of transforms",
     "odom": "the poses on a topic",
     "fused": "fused from several sensors",
+    "scans": "found by the scans alone",
     "still": "the robot is taken to stand still",
 }
 """What the sources of poses are."""

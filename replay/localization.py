@@ -77,11 +77,30 @@ def localize(scans: ScanLog, options: ReplayOptions, timer: StageTimer) -> Local
         LogReadError: The log has no such poses.
         UsageError: The options do not fit the log.
     """
+    found = choose_poses(scans, options, timer)
+    return _matched(found, options, timer) if found.poses.source == SCANS or options.match_scans else found
+
+
+def choose_poses(scans: ScanLog, options: ReplayOptions, timer: StageTimer) -> Localization:
+    """Choose the source of poses, without matching scans.
+
+    Args:
+        scans: The scans that are replayed.
+        options: Options of the replay.
+        timer: Counts the time of reading scans towards the stage «read».
+
+    Returns:
+        The poses; where the scans alone are to give them, those of a robot that stands still.
+
+    Raises:
+        LogReadError: The log has no such poses.
+        UsageError: The options do not fit the log.
+    """
     provider = PoseProvider(scans.log, options.odom_topic, options.laser_offset, options.fuse)
     found = _look_up_poses(provider, _retimed(scans, options), options)
     found = _where_scans_fit(provider, found, options, timer)
     if found.poses.source == SCANS:
-        return _matched(found, options, timer)
+        return found
     if options.sweep == SweepName.AUTO:
         found = _with_beam_times_that_fit(provider, found, options, timer)
     elif not scans.sweep:
@@ -89,7 +108,7 @@ def localize(scans: ScanLog, options: ReplayOptions, timer: StageTimer) -> Local
         found = found._replace(notes=(*found.notes, note))
     if found.poses.mount_assumed and len(scans.scanners) == 1:
         found = found._replace(poses=_with_suggested_mount(found.poses, found.scans, options, timer))
-    return _matched(found, options, timer) if options.match_scans else found
+    return found
 
 
 def _matched(found: Localization, options: ReplayOptions, timer: StageTimer) -> Localization:

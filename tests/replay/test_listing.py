@@ -1,16 +1,23 @@
 """What a log holds, as a table and as JSON."""
 
 import json
+from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
 from prim import console
+from prim.choices import PoseSourceName
+from prim.log.messages import SCAN_TYPE, encode_scan
+from prim.log.writer import LogWriter
+from prim.scan import Scan
 from recorder.session import Session
 from replay.cli import app
-from replay.listing import summarize_log
+from replay.listing import SOURCES, summarize_log
 from replay.options import ReplayOptions
 from replay.outputs.exports import log_stem
+from replay.poses.laser_poses import STILL
 
 
 def listed(*arguments: object) -> int:
@@ -44,6 +51,24 @@ def test_the_list_as_json(noisy_session: Session, capsys: pytest.CaptureFixture[
     assert found["schema"] == "prim-list/1"
     assert {topic["name"]: topic["holds"] for topic in found["topics"]}["/scan"] == "scans"
     assert found["poses"]["why"] == "the ground truth"
+
+
+def test_a_log_of_scans_alone_is_listed_without_matching_them(
+    in_tmp: Path, monkeypatch: pytest.MonkeyPatch, make_scan: Callable[..., Scan]
+) -> None:
+    monkeypatch.setattr("replay.localization._matched", None)
+    with LogWriter(Path("a.mcap")) as log:
+        log.add_topic("/scan", SCAN_TYPE)
+        for second in range(1, 6):
+            stamp = second * 10**9
+            log.write("/scan", stamp, encode_scan(replace(make_scan(1.0, 1.0, 1.0, 1.0), stamp=stamp)))
+    summary = summarize_log(Path("a.mcap"), ReplayOptions())
+    assert (summary.poses.source, summary.poses.why) == ("/scan", "found by the scans alone")
+    assert any("they are found by the scans alone" in note for note in summary.notes)
+
+
+def test_every_source_of_poses_is_described() -> None:
+    assert {*SOURCES} == {*PoseSourceName, STILL} - {PoseSourceName.AUTO}
 
 
 def test_what_a_log_lacks_is_said(in_tmp: Path, capsys: pytest.CaptureFixture[str]) -> None:
