@@ -88,6 +88,12 @@ class TrackingOptions:
         deviations: A search reaches this many standard deviations …
         least_window: … but no less than this (m, rad).
         velocity_window: What a search by constant velocity alone reaches (m, rad).
+        longest_reach: The longest that this becomes where scans are far apart in time (m).
+        charge: What a search's score loses for one standard deviation from the prediction …
+        wide_charge: … and, where a lost scan is searched for, for a metre or a radian.
+        usual_gap: Where scans are further apart in time (s) than this, constant velocity is trusted less …
+        most_stretch: … by this factor at most; nor is motion continued by more.
+        least_gap: The time between two scans counts as this (s) at least.
         speed: The speed (m/s) that a search has to reach where scans are far apart in time.
         longest_step: Scans further apart in time (s) do not continue the motion.
         different: Odometry and constant velocity are both tried where they differ by more than this share of the
@@ -127,6 +133,12 @@ class TrackingOptions:
     deviations: float = 2.5
     least_window: tuple[float, float] = (0.1, math.radians(3))
     velocity_window: tuple[float, float] = (0.35, math.radians(20))
+    longest_reach: float = 1.5
+    charge: float = 0.02
+    wide_charge: float = 0.01
+    usual_gap: float = 0.5
+    most_stretch: float = 4.0
+    least_gap: float = 1e-3
     speed: float = 0.7
     longest_step: float = 2.0
     different: float = 0.5

@@ -268,7 +268,8 @@ class ScanTracker:
         """Search around a prediction, and fit from what is found."""
         place, turn = prediction.std
         least_place, least_turn = self.options.least_window
-        cost = 0.02 / max(place, 0.5 * least_place), 0.02 / max(turn, least_turn)
+        charge = self.options.charge
+        cost = charge / max(place, least_place / 2), charge / max(turn, least_turn)
         window = Window(*prediction.window, self.options.map.turn, *cost)
         found = local.search(self._coarse[number], prediction.pose, window, levels)
         start = prediction.pose if found is None else found
@@ -281,7 +282,7 @@ class ScanTracker:
         gap = (self.stamps[number] - self.stamps[number - 1]) / 1e9
         reach = min(reach + options.speed * gap, options.widest)
         turn = math.pi if gap > options.longest_step else turn
-        window = Window(reach, turn, options.map.turn, 0.01, 0.01)
+        window = Window(reach, turn, options.map.turn, options.wide_charge, options.wide_charge)
         matches = []
         for middle in [one.pose for one in predictions] + [self.poses[number - 1]]:
             found = local.search(self._coarse[number], middle, window, options.map.wide_levels, options.broken / 2)
@@ -292,16 +293,16 @@ class ScanTracker:
     def _predictions(self, number: int) -> list[_Prediction]:
         """Return where odometry and constant velocity expect a scan, the more trusted one first."""
         options = self.options
-        gap = max((self.stamps[number] - self.stamps[number - 1]) / 1e9, 1e-3)
+        gap = max((self.stamps[number] - self.stamps[number - 1]) / 1e9, options.least_gap)
         last = self.poses[number - 1 : number]
-        stretch = max(1.0, min(gap / 0.5, 4.0))
+        stretch = min(max(gap / options.usual_gap, 1.0), options.most_stretch)
         before = (self.stamps[number - 1] - self.stamps[number - 2]) / 1e9 if number > 1 else 0.0
         step = np.zeros((1, 3))
         if before > 0 and gap < options.longest_step:
-            step = relative_poses(self.poses[number - 2 : number - 1], last) * min(gap / before, 3.0)
+            step = relative_poses(self.poses[number - 2 : number - 1], last) * min(gap / before, options.most_stretch)
         place, turn = (stretch * std for std in options.velocity_std)
         reach, around = options.velocity_window
-        reach = min(max(reach, options.speed * gap * 0.5), 1.5)
+        reach = min(max(reach, options.speed * gap / 2), options.longest_reach)
         window = reach, min(around * stretch, options.wide_window[1])
         by_velocity = _Prediction(compose_poses(last, step)[0], (place, turn), window)
         if self.odometry is None:
