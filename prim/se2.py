@@ -263,6 +263,22 @@ def compose_covariances(covariances: FloatArray, poses: FloatArray, children: Fl
     return carried
 
 
+def frame_motions(covariances: FloatArray, poses: FloatArray) -> FloatArray:
+    """Compute the covariances of the motions of a frame by which errors of poses move what is seen from them.
+
+    Args:
+        covariances: (N, 3, 3) of the poses.
+        poses: (N, 3) in the frame.
+
+    Returns:
+        (N, 3, 3) of the frame's pose, at its origin and in its axes: the inverse of :func:`frame_covariances`.
+    """
+    jacobian = np.broadcast_to(np.eye(3), (len(poses), 3, 3)).copy()
+    jacobian[:, 0, 2], jacobian[:, 1, 2] = poses[:, 1], -poses[:, 0]
+    motions: FloatArray = jacobian @ covariances @ jacobian.transpose(0, 2, 1)
+    return motions
+
+
 def frame_covariances(covariance: FloatArray, poses: FloatArray) -> FloatArray:
     """Compute what an uncertain frame adds to the covariances of poses that are given in it.
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 
 from prim.arrays import FloatArray, Stamps
 from prim.choices import PoseSourceName, SweepName
-from prim.se2 import Pose2D
+from prim.scan import PosedScan
+from prim.se2 import Pose2D, frame_motions
 
 if TYPE_CHECKING:
     from replay.poses.fusion import Fusion
@@ -189,9 +190,8 @@ class LaserPoses:
             return self.frame_covariance
         away = np.where(self.valid, np.hypot(self.poses[:, 0] - x, self.poses[:, 1] - y), np.inf)
         nearest = int(np.argmin(away))
-        px, py, _ = self.poses[nearest].tolist()
-        back = np.array([[1.0, 0.0, py], [0.0, 1.0, -px], [0.0, 0.0, 1.0]])
-        return np.asarray(back @ self.covariances[nearest] @ back.T)
+        here = slice(nearest, nearest + 1)
+        return np.asarray(frame_motions(self.covariances[here], self.poses[here])[0])
 
     def at(self, position: int) -> Pose2D:
         """Return the pose of the scan at this index, with its covariance where that is known."""
@@ -206,3 +206,7 @@ class LaserPoses:
     def end_at(self, position: int) -> Pose2D | None:
         """Return the pose at the last beam of the scan at this index; None where that is taken with the first."""
         return None if self.end_poses is None else Pose2D(*self.end_poses[position].tolist())
+
+
+PosedScanSource = Callable[[LaserPoses], Iterable[PosedScan]]
+"""Yields the scans of a log with the poses that it is given."""

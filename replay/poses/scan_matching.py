@@ -12,7 +12,7 @@ root of var x + var y + (1 m)^2 var theta.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -29,6 +29,7 @@ from prim.se2 import (
     compose_covariances,
     compose_poses,
     frame_covariances,
+    frame_motions,
     inverse_poses,
     relative_poses,
     relative_steps,
@@ -39,10 +40,7 @@ from replay.poses.fusion import Fusion
 from replay.poses.fusion_nodes import FusionNodes
 from replay.poses.fusion_options import SensorNoise
 from replay.poses.kalman import FilterState, QuadraticTerms, pack_symmetric, unpack_symmetric
-from replay.poses.laser_poses import LaserPoses
-
-PosedScanSource = Callable[[LaserPoses], Iterable[PosedScan]]
-"""Yields the scans of a log with the poses that it is given."""
+from replay.poses.laser_poses import LaserPoses, PosedScanSource
 
 
 @dataclass(frozen=True)
@@ -250,7 +248,7 @@ class ScanMatcher:
         """Smooth the poses of the first ``count`` nodes with the scans' log-likelihoods."""
         estimate = self._fusion.smoothed(terms, self._inflation, count, self._floats)
         if self._floats:
-            self._frame_covariance = _covariance_at_origin(estimate.poses[0], estimate.covariances[0])
+            self._frame_covariance = frame_motions(estimate.covariances[:1], estimate.poses[:1])[0]
             estimate = estimate.seen_from_first(self._fusion.initial_state)
         self._node_poses[:count] = estimate.poses
         self._covariances[:count] = pack_symmetric(estimate.covariances)
@@ -387,12 +385,6 @@ def reposed(posed: PosedScan, pose: Pose2D) -> Iterator[tuple[Scan, Pose2D]]:
     back = Pose2D(posed.pose.x, posed.pose.y, posed.pose.theta).inverse()
     for scan, at in posed.pieces:
         yield scan, pose @ (back @ Pose2D(at.x, at.y, at.theta))
-
-
-def _covariance_at_origin(pose: FloatArray, covariance: FloatArray) -> FloatArray:
-    """Return the covariance (3, 3) of the motion of a frame, at its origin, by which a pose's errors move it."""
-    carried = np.array([[1.0, 0.0, pose[1]], [0.0, 1.0, -pose[0]], [0.0, 0.0, 1.0]])
-    return np.asarray(carried @ covariance @ carried.T)
 
 
 def _fusion_of(poses: LaserPoses, stamps: Stamps, noise: SensorNoise, options: ScanMatchingOptions) -> Fusion:

@@ -116,6 +116,17 @@ def test_covariances_of_arrays_are_composed_as_those_of_single_poses_are(
 
 
 @given(arrays(float, st.tuples(st.integers(0, 5), st.just(3)), elements=COORDINATES), st.integers(0, 2**32))
+def test_motions_of_the_frame_are_what_errors_of_poses_make_of_it(poses: np.ndarray, seed: int) -> None:
+    spread = covariances(np.random.default_rng(seed), len(poses))
+    motions = se2.frame_motions(spread, poses)
+    back = [se2.frame_covariances(one, pose[None])[0] for one, pose in zip(motions, poses, strict=True)]
+    scale = 1 + np.abs(motions).max(initial=0.0)
+    assert np.reshape(back, spread.shape) == pytest.approx(
+        spread, abs=1e-9 * scale * (1 + np.abs(poses).max(initial=0.0)) ** 2
+    )
+
+
+@given(arrays(float, st.tuples(st.integers(0, 5), st.just(3)), elements=COORDINATES), st.integers(0, 2**32))
 def test_an_uncertain_frame_adds_to_the_poses_in_it(poses: np.ndarray, seed: int) -> None:
     """As J P J', with the Jacobian J by differences of a frame near the identity composed with each pose."""
     covariance = covariances(np.random.default_rng(seed), 1)[0]

@@ -3,20 +3,15 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable
 from dataclasses import replace
 
 import numpy as np
 
 from prim.arrays import FloatArray
-from prim.scan import PosedScan
 from prim.se2 import Trajectory, compose_poses, inverse_poses, path_length, wrap_angles
-from replay.poses.laser_poses import SCANS, LaserPoses, ScanTimes
+from replay.poses.laser_poses import SCANS, LaserPoses, PosedScanSource, ScanTimes
 from replay.poses.tracking.options import DEFAULTS, TrackingOptions
 from replay.poses.tracking.scan_tracker import ScanTrack, track
-
-PosedScanSource = Callable[[LaserPoses], Iterable[PosedScan]]
-"""Yields the scans of a log with the poses that it is given."""
 
 
 def track_poses(

@@ -18,7 +18,7 @@ class PointOptions:
         gap: Neighbours that are further apart (m) lie on different surfaces …
         gap_beams: … or further than so many times the distance of neighbouring beams there.
         flatness: The largest ratio of the variances across and along a line.
-        least_noise: The range noise counts as at least this (m).
+        least_noise: Residuals count as having at least this standard deviation (m).
         coarse: Distance (m) of the points that a search uses.
         fine: Distance (m) of the points that a map is made of.
     """

@@ -12,10 +12,10 @@ from typing import NamedTuple
 import numpy as np
 
 from prim.scan import PosedScan
+from replay.poses.scan_registration import range_noise
 from replay.poses.tracking.local_map import LocalMap, joined
 from replay.poses.tracking.options import DEFAULTS, TrackingOptions
 from replay.poses.tracking.points import moved, scan_points
-from replay.poses.tracking.scan_tracker import noise_of
 
 
 class ScanFit(NamedTuple):
@@ -83,7 +83,7 @@ def scan_fit(windows: Sequence[Sequence[PosedScan]], options: TrackingOptions = 
     Returns:
         The fit.
     """
-    noise_std = max(noise_of([posed for window in windows for posed in window]), options.points.least_noise)
+    noise_std = range_noise([posed.scan for window in windows for posed in window])
     place, turn = options.misplaced
     nearby = np.diag([place**-2, place**-2, turn**-2])
     given, matched = [], []

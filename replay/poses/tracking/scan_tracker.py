@@ -14,11 +14,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from mapping.range_noise import neighbour_noise
 from prim import linear_algebra
 from prim.arrays import FloatArray, Stamps
 from prim.scan import PosedScan
 from prim.se2 import compose_poses, path_length, relative_poses, wrap_angles
+from replay.poses.scan_registration import range_noise
 from replay.poses.tracking.kernels import Window
 from replay.poses.tracking.local_map import LocalMap, Match, joined
 from replay.poses.tracking.options import DEFAULTS, TrackingOptions
@@ -74,7 +74,7 @@ def track(
     Returns:
         The track.
     """
-    noise_std = max(noise_of(scans), options.points.least_noise)
+    noise_std = range_noise([posed.scan for posed in scans])
     points = [scan_points(posed, noise_std, options.points) for posed in scans]
     stamps = np.array([posed.scan.stamp for posed in scans], dtype=np.int64)
     tracker = ScanTracker(points, stamps, odometry, options)
@@ -102,20 +102,6 @@ def _stands_still(odometry: FloatArray, poses: FloatArray, options: TrackingOpti
     """Tell whether odometry stands still where tracked poses move."""
     tracked = path_length(poses)
     return tracked > options.least_path and path_length(odometry) < options.least_share * tracked
-
-
-def noise_of(scans: Sequence[PosedScan]) -> float:
-    """Estimate the range noise of scans without a map.
-
-    Args:
-        scans: The scans.
-
-    Returns:
-        The median of their own standard deviations (m); 0 where none has one.
-    """
-    ranges = (posed.scan.ranges[posed.scan.measured] for posed in scans)
-    stds = [std for measured in ranges if (std := neighbour_noise(measured)) is not None]
-    return float(np.median(stds)) if stds else 0.0
 
 
 class _Prediction(NamedTuple):

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from prim.arrays import FloatArray
-from prim.se2 import frame_covariances
+from prim.se2 import frame_covariances, frame_motions
 
 
 @dataclass(frozen=True)
@@ -55,14 +55,13 @@ class TrackErrors:
         Returns:
             The errors.
         """
-        back = np.repeat(np.eye(3)[None], len(poses), axis=0)
-        back[:, 0, 2], back[:, 1, 2] = poses[:, 1], -poses[:, 0]
-        own = back @ covariances @ back.transpose(0, 2, 1)
+        own = frame_motions(covariances, poses)
         steps = np.zeros_like(own)
         later = np.array(keyframes[1:], dtype=np.intp)
         steps[later] = own[later]
         lost = np.array(breaks, dtype=np.intp)
-        steps[lost] += (back @ back.transpose(0, 2, 1))[lost] * break_std**2
+        anywhere = np.repeat(break_std**2 * np.eye(3)[None], len(lost), axis=0)
+        steps[lost] += frame_motions(anywhere, poses[lost])
         return cls(poses, own, np.cumsum(steps, axis=0), first_std)
 
     def since_first(self) -> FloatArray:
