@@ -41,6 +41,7 @@ def filter_nodes(
     initial: FilterState,
     options: FusionOptions,
     scans: QuadraticTerms | None = None,
+    headings: FloatArray | None = None,
 ) -> FilterOutput:
     """Run the filter.
 
@@ -50,6 +51,8 @@ def filter_nodes(
         initial: The belief before the first node.
         options: Gates.
         scans: The scans' log-likelihoods of the poses at the nodes.
+        headings: Headings (N,) at the nodes (rad, not wrapped) about which the motion is linear; None: the filter's
+            own, which know less.
 
     Returns:
         States, covariances and costs at the nodes.
@@ -62,6 +65,7 @@ def filter_nodes(
         nodes.fix_scales,
         nodes.headings,
         QuadraticTerms.zeros(0) if scans is None else scans,
+        np.full(len(nodes.stamps), np.nan) if headings is None else np.concatenate((headings[:1], headings[:-1])),
     )
     # without odometry a turn cannot be distinguished from a wrong heading, and nothing is rejected
     thresholds = (options.fix_gate, options.heading_gate) if nodes.has_odometry else (math.inf, math.inf)
@@ -95,7 +99,7 @@ def with_wander(belief: FilterState, noise: FloatArray, options: FusionOptions) 
     return FilterState(mean, covariance)
 
 
-def initial_noise(nodes: FusionNodes, given: SensorNoise, options: FusionOptions) -> FloatArray:
+def first_noise(nodes: FusionNodes, given: SensorNoise, options: FusionOptions) -> FloatArray:
     """Find the noise that an estimate begins at.
 
     Args:
@@ -166,7 +170,7 @@ def _aligned_heading(nodes: FusionNodes, odometry: FloatArray, noise: FloatArray
     return _rotation_between(moved, fixes)
 
 
-def scatter(nodes: FusionNodes, noise: FloatArray, parameter: int) -> float:
+def scatter_about_odometry(nodes: FusionNodes, noise: FloatArray, parameter: int) -> float:
     """Measure how readings scatter about the aligned odometry.
 
     Args:

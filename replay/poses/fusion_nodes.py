@@ -9,12 +9,10 @@ from numpy.typing import NDArray
 
 from prim.arrays import FloatArray, Stamps
 from prim.se2 import Trajectory, integrate_steps, relative_steps, wrap_angles
-from replay.poses.fusion_options import FusionOptions
+from replay.poses.fusion_options import DEFAULTS, FusionOptions
 
 TimedValues = tuple[Stamps, FloatArray]
 """Stamps (M,) in ns, rising, and the values measured then: (M,) or (M, columns)."""
-
-DEFAULTS = FusionOptions()
 
 
 @dataclass(frozen=True)

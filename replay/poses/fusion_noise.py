@@ -8,7 +8,13 @@ import numpy as np
 
 from prim.arrays import FloatArray
 from prim.se2 import integrate_steps
-from replay.poses.fusion_filter import filter_nodes, initial_noise, initial_state, median_angle, scatter
+from replay.poses.fusion_filter import (
+    filter_nodes,
+    first_noise,
+    initial_state,
+    median_angle,
+    scatter_about_odometry,
+)
 from replay.poses.fusion_nodes import FusionNodes
 from replay.poses.fusion_options import FusionOptions, SensorNoise
 from replay.poses.kalman import (
@@ -56,7 +62,7 @@ class NoiseSearch:
     def __init__(self, nodes: FusionNodes, given: SensorNoise, options: FusionOptions) -> None:
         self._nodes, self._given, self._options = nodes, given, options
         self._has_fixes, self._has_headings = bool(nodes.has_fix.any()), bool(nodes.has_heading.any())
-        self.noise = initial_noise(nodes, given, options)
+        self.noise = first_noise(nodes, given, options)
         self.initial = initial_state(nodes, self.noise, options)
         if self._has_headings and not nodes.has_north:
             # where the 0 of an IMU is, but for what the state holds of it
@@ -111,6 +117,11 @@ class NoiseSearch:
 
     def _find_wander(self, initial: FloatArray, free: list[int], std: int, time: int) -> None:
         """Estimate a wandering error, and keep it where the readings are clearly more likely with it."""
+        steps = self._nodes.steps
+        moved = np.hypot(steps[:, 0], steps[:, 1]) if std == WANDER_STD else np.abs(steps[:, 2])
+        spread = scatter_about_odometry(self._nodes, self.noise, std)
+        if moved.sum() < spread:  # odometry that stands still says nothing of where readings should be
+            return
         options, estimator = self._options, self._estimator(self._options.estimation.wander_nodes)
         plain = estimator.maximize(self.noise, free)
         modes, before = initial.copy(), self.initial
@@ -120,7 +131,7 @@ class NoiseSearch:
         best, found, gain = before, plain, 0.0
         for seconds in options.wander_times:
             begin = modes.copy()  # not from where the wandering is absorbed as other noise
-            begin[std], begin[time] = stated or scatter(self._nodes, self.noise, std), seconds
+            begin[std], begin[time] = stated or spread, seconds
             self.initial = initial_state(self._nodes, begin, self._options)
             noise = estimator.maximize(begin, [*free, std, time])
             gained = plain_cost - estimator.cost(noise, begin, [*free, std, time])

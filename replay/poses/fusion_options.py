@@ -210,8 +210,21 @@ class FusionOptions:
     """Standard deviation of the initial position from fixes: a constant (m), and a multiple of the fixes' noise; set
     by hand."""
 
+    max_smoothings: int = 8
+    """Poses are smoothed at most so often, each time linear about the headings of the one before (Bell, 1994); set by
+    hand."""
+
+    linear_heading: float = 0.05
+    """They are smoothed again where these change a heading by more (rad); set by hand."""
+
+    least_gain: float = 1.05
+    """Poses are fused unasked where that makes them surer by this factor (Fusion.gain_over_odometry); set by hand."""
+
     alignment_ratio: float = 5.0
     """Odometry and fixes are aligned once the robot has come so many times as far as the fixes' noise; set by
     hand."""
 
     estimation: NoiseEstimationOptions = field(default_factory=NoiseEstimationOptions)
+
+
+DEFAULTS = FusionOptions()

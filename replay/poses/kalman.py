@@ -29,10 +29,10 @@ FIX_STD, HEADING_STD, TRANSLATION_STD, ROTATION_STD, HEADING_BIAS = range(5)
 translation (m, along each axis) and rotation (rad) where its variance scale is 1, that is after one metre straight on
 or, without odometry, after one second; and the constant offset of all headings (rad)."""
 
-SCALES = DISTANCE_SCALE, TURN_SCALE = (5, 6)
+SCALES = DISTANCE_SCALE, TURN_SCALE = tuple(range(5, 7))
 """Factors that the odometry's distances and turns are multiplied by."""
 
-WANDER = WANDER_STD, WANDER_TIME, HEADING_WANDER_STD, HEADING_WANDER_TIME = (7, 8, 9, 10)
+WANDER = WANDER_STD, WANDER_TIME, HEADING_WANDER_STD, HEADING_WANDER_TIME = tuple(range(7, 11))
 TIMES = WANDER_TIME, HEADING_WANDER_TIME
 """Standard deviations (m along each axis; rad) and time constants (s) of wandering errors of fixes and headings."""
 
@@ -111,8 +111,10 @@ class Measurements(NamedTuple):
         intervals: Times (N,) since the node before (s).
         fixes: Positions of the antenna (N, 2) in m; NaN where there is none.
         fix_scales: Factors (N,) of each fix's standard deviation.
-        headings: Compass headings (N,) in rad; NaN where there is none.
+        headings: Headings (N,) in rad; NaN where there is none.
         scans: The scans' log-likelihoods; of N nodes, or of none at all.
+        references: Headings (N,) at the node before (rad, not wrapped), about which steps are linear; NaN: about the
+            filter's own.
     """
 
     steps: FloatArray
@@ -122,6 +124,7 @@ class Measurements(NamedTuple):
     fix_scales: FloatArray
     headings: FloatArray
     scans: QuadraticTerms
+    references: FloatArray
 
 
 class Gate(NamedTuple):
@@ -167,6 +170,7 @@ class FilterOutput(NamedTuple):
         costs: Minus twice the log-likelihood (N,) of each node's fix and heading, up to a constant.
         decisions: Whether each node's fix and heading (N, 2) were USED, REJECTED or absent (0).
         kept: How much (N, K) of each number of the state is left after a step: less than 1 of wandering errors.
+        motions: Each step (N, 2) in the map frame (m), with the heading that it is linear about.
     """
 
     means: FloatArray
@@ -176,10 +180,19 @@ class FilterOutput(NamedTuple):
     costs: FloatArray
     decisions: NDArray[np.int64]
     kept: FloatArray
+    motions: FloatArray
 
     @classmethod
     def empty(cls, nodes: int, size: int) -> FilterOutput:
-        """Return uninitialised arrays for so many nodes, and a state of so many numbers."""
+        """Return uninitialised arrays.
+
+        Args:
+            nodes: How many nodes there are.
+            size: How many numbers the state has.
+
+        Returns:
+            The arrays.
+        """
         return cls(
             np.empty((nodes, size)),
             np.empty((nodes, size, size)),
@@ -188,6 +201,7 @@ class FilterOutput(NamedTuple):
             np.empty(nodes),
             np.empty((nodes, 2), np.int64),
             np.ones((nodes, size)),
+            np.empty((nodes, 2)),
         )
 
 
@@ -214,12 +228,16 @@ def _update(mean: Any, cov: Any, row: Any, variance: float, innovation: float, w
 
 
 @inline
-def _predict(mean: Any, cov: Any, step: Any, position_variance: float, heading_variance: float) -> None:
-    """Move the pose by a step in the robot's frame and add the process noise."""
-    cos, sin = math.cos(mean[2]), math.sin(mean[2])
+def _predict(
+    mean: Any, cov: Any, step: Any, reference: float, position_variance: float, heading_variance: float, motion: Any
+) -> None:
+    """Move the pose by a step in the robot's frame and add the process noise; ``motion`` gets it in the map frame."""
+    heading = mean[2] if math.isnan(reference) else reference
+    cos, sin = math.cos(heading), math.sin(heading)
     dx, dy = cos * step[0] - sin * step[1], sin * step[0] + cos * step[1]
-    mean[0] += dx
-    mean[1] += dy
+    motion[0], motion[1] = dx, dy
+    mean[0] += dx - dy * (mean[2] - heading)
+    mean[1] += dy + dx * (mean[2] - heading)
     mean[2] += step[2]
     size = len(mean)
     for j in range(size):
@@ -393,11 +411,12 @@ def run_filter(initial: FilterState, measurements: Measurements, model: FilterMo
         model.noise,
         model.lever_arm,
     )
-    intervals, fixes, fix_scales, headings = (
+    intervals, fixes, fix_scales, headings, references = (
         measurements.intervals,
         measurements.fixes,
         measurements.fix_scales,
         measurements.headings,
+        measurements.references,
     )
     gradients, information, centers = (
         measurements.scans.gradients,
@@ -405,7 +424,8 @@ def run_filter(initial: FilterState, measurements: Measurements, model: FilterMo
         measurements.scans.centers,
     )
     means, covariances, costs, decisions = output.means, output.covariances, output.costs, output.decisions
-    predicted_means, predicted_covariances, kept = output.predicted_means, output.predicted_covariances, output.kept
+    predicted_means, predicted_covariances = output.predicted_means, output.predicted_covariances
+    kept, motions = output.kept, output.motions
     mean, cov = initial.mean.copy(), initial.covariance.copy()
     work, squares, step = np.empty((3, len(mean))), np.empty((3, 3, 3)), np.empty(3)
     fix_variance, heading_variance = noise[FIX_STD] ** 2, noise[HEADING_STD] ** 2
@@ -416,7 +436,7 @@ def run_filter(initial: FilterState, measurements: Measurements, model: FilterMo
         rotation_variance = variance_scales[k] * noise[ROTATION_STD] ** 2 + min_variance
         step[0], step[1] = steps[k, 0] * noise[DISTANCE_SCALE], steps[k, 1] * noise[DISTANCE_SCALE]
         step[2] = steps[k, 2] * noise[TURN_SCALE]
-        _predict(mean, cov, step, translation_variance, rotation_variance)
+        _predict(mean, cov, step, references[k], translation_variance, rotation_variance, motions[k])
         _decay(mean, cov, noise, intervals[k], min_variance, kept[k])
         predicted_means[k], predicted_covariances[k] = mean, cov
         predicted = predicted_covariances[k]
@@ -452,12 +472,13 @@ def smooth(filtered: FilterOutput, gains: Any) -> None:
         gains: Filled (N, K, K): the smoother's gains, by which a node's error depends on the next one's.
     """
     means, covs = filtered.means, filtered.covariances
-    predicted, predicted_covs, kept = filtered.predicted_means, filtered.predicted_covariances, filtered.kept
+    predicted, predicted_covs = filtered.predicted_means, filtered.predicted_covariances
+    kept, motions = filtered.kept, filtered.motions
     size = means.shape[1]
     factor, shared = np.empty((size, size)), np.empty((size, size))
     gain, product = np.empty((size, size)), np.empty((size, size))
     for k in range(len(means) - 2, -1, -1):
-        _correlate_with_next(covs[k], means[k], predicted[k + 1], kept[k + 1], shared)
+        _correlate_with_next(covs[k], motions[k + 1], kept[k + 1], shared)
         _factorize(predicted_covs[k + 1], factor)
         for i in range(size):
             _solve_factorized(factor, shared[i], gain[i])
@@ -476,12 +497,13 @@ def smooth(filtered: FilterOutput, gains: Any) -> None:
 
 
 @inline
-def _correlate_with_next(cov: Any, mean: Any, following: Any, kept: Any, out: Any) -> None:
+def _correlate_with_next(cov: Any, motion: Any, kept: Any, out: Any) -> None:
     """Compute the covariance of a state with the next one as it is predicted."""
-    dx, dy = following[0] - mean[0], following[1] - mean[1]
-    for i in range(len(mean)):
-        out[i, 0], out[i, 1], out[i, 2] = cov[i, 0] - dy * cov[i, 2], cov[i, 1] + dx * cov[i, 2], cov[i, 2]
-        for j in range(POSE, len(mean)):
+    for i in range(len(cov)):
+        out[i, 0] = cov[i, 0] - motion[1] * cov[i, 2]
+        out[i, 1] = cov[i, 1] + motion[0] * cov[i, 2]
+        out[i, 2] = cov[i, 2]
+        for j in range(POSE, len(cov)):
             out[i, j] = cov[i, j] * kept[j]
 
 

@@ -72,8 +72,8 @@ class NoiseEstimator:
         Returns:
             The cost.
         """
-        ratios = _log_ratios(noise, initial, free) / [self._prior_std(index) for index in free]
-        return float(self._costs(noise).sum() + (ratios**2).sum())
+        squares = (_log_ratios(noise, initial, free) / self._prior_stds(free)) ** 2
+        return float(self._costs(noise).sum() + squares.sum())
 
     def is_significant(self, noise: FloatArray, parameter: int) -> bool:
         """Test by its score whether a parameter differs from its value in ``noise`` (after Rao, 1948).
@@ -95,14 +95,18 @@ class NoiseEstimator:
         """Return a scoring step on the log-posterior (len(free),), limited in size."""
         options = self._options
         scores = self._node_scores(noise, free)
-        prior_information = np.array([self._prior_std(index) for index in free]) ** -2.0
-        prior_score = -_log_ratios(noise, initial, free) * prior_information
+        ratios, prior_information = _log_ratios(noise, initial, free), self._prior_stds(free) ** -2.0
+        prior_score = -ratios * prior_information
         information = scores.T @ scores + np.diag(prior_information) + options.ridge * np.eye(len(free))
         step = linear_algebra.solve(information, scores.sum(axis=0) + prior_score)
         if step is None:  # the readings say nothing: the search ends here
             return np.zeros(len(free))
         limited: FloatArray = np.clip(step, -options.max_step, options.max_step)
         return limited
+
+    def _prior_stds(self, free: Sequence[int]) -> FloatArray:
+        """Return the standard deviations (len(free),) of the priors (nepers)."""
+        return np.array([self._prior_std(index) for index in free])
 
     def _prior_std(self, index: int) -> float:
         """Return the standard deviation of a parameter's prior (nepers); infinite for the bias, which has none."""

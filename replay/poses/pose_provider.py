@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shlex
 from collections.abc import Iterator, Sequence
+from copy import copy
 from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
@@ -143,6 +144,19 @@ class PoseProvider:
                 "two clocks in one log? by when messages were logged: --clock log",
             )
         return poses
+
+    def with_odometry_noise(self, std: tuple[float, float]) -> PoseProvider:
+        """Return a provider that fuses with another expectation of the odometry's noise.
+
+        Args:
+            std: Standard deviations (m, rad) after one metre.
+
+        Returns:
+            The provider.
+        """
+        other = copy(self)
+        other._options = replace(self._options, fusion=replace(self._options.fusion, default_odometry_std=std))
+        return other
 
     def stationary_poses(self, scans: ScanTimes) -> LaserPoses:
         """Return the poses of a robot that stands at the map's origin at all times.

@@ -123,7 +123,15 @@ def quaternion(heading: float) -> tuple[float, float, float, float]:
 
 
 def plane_variance(covariance: Sequence[float], is_known: bool) -> float:
-    """Return the mean variance (m^2) along the first two axes of a covariance (9,); NaN where it cannot be one."""
+    """Find the variance of a position in the plane.
+
+    Args:
+        covariance: That of x, y, z: (9,) in m^2.
+        is_known: Whether the message says that it is.
+
+    Returns:
+        The mean along x and y; NaN where it is not known, or cannot be one.
+    """
     if not is_known or len(covariance) != 9:
         return math.nan
     variance = (covariance[0] + covariance[4]) / 2

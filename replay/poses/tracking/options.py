@@ -120,6 +120,9 @@ class TrackingOptions:
         sure_score: … where scans have a median score above this.
         least_path: Where scans move by more than this (m) …
         least_share: … and odometry by less than this share of it, it is taken to stand still.
+        least_spread: Scans show the odometry's noise where they are so far (m) from those before them …
+        least_windows: … and so many are …
+        least_odometry_std: … but none less than this after one metre (m, rad).
     """
 
     points: PointOptions = field(default_factory=PointOptions)
@@ -163,6 +166,9 @@ class TrackingOptions:
     sure_score: float = 0.8
     least_path: float = 0.5
     least_share: float = 0.1
+    least_spread: float = 0.01
+    least_windows: int = 12
+    least_odometry_std: tuple[float, float] = (0.005, math.radians(0.3))
 
 
 DEFAULTS = TrackingOptions()
