@@ -120,7 +120,7 @@ def _matched(found: Localization, options: ReplayOptions, timer: StageTimer) -> 
     """
     from replay.mapping.bounds import bounds_of_bulk  # when they are needed: a replay without them starts faster
     from replay.poses.scan_matching import match_scans
-    from replay.poses.tracking.laser_track import track_poses
+    from replay.poses.tracking.laser_track import corrected_odometry, track_poses
     from replay.poses.tracking.options import DEFAULTS as TRACKING
 
     scans, poses = found.scans, found.poses
@@ -132,6 +132,8 @@ def _matched(found: Localization, options: ReplayOptions, timer: StageTimer) -> 
             return found._replace(poses=replace(tracked, matched=True))
         if poses.source == SCANS or track.overrules:
             poses = tracked
+        elif track.fits:
+            poses = corrected_odometry(poses, scans.times, track.odometry_errors)
     bounds = options.bounds or bounds_of_bulk(posed(poses), options.resolution)
     poses = match_scans(poses, scans.stamps, posed, options.resolution, options.noise_std, options.fuse.noise, bounds)
     if poses.source == SCANS and not track.fits:

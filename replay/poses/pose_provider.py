@@ -31,6 +31,7 @@ from replay.poses.fusion_options import (
 )
 from replay.poses.laser_poses import FUSED, STILL, FusedSensor, LaserPoses, ScanTimes
 from replay.poses.mount import SensorMounts, assumed_note
+from replay.poses.odometry_errors import OdometryErrors
 from replay.poses.sensors import (
     SCANS_HINT,
     SensorLogs,
@@ -440,23 +441,8 @@ class PoseProvider:
                 size = f"{sensor.wander.std:.2f} m" if sensor.name == GPS else f"{np.degrees(sensor.wander.std):.1f}°"
                 slow = f"errors wander by {size} over {sensor.wander.time:.0f} s"
                 notes += (f"{sensor.topic}: {slow}, beside those that change from reading to reading: both count",)
-            if sensor.scales != (1.0, 1.0):
-                notes += (scales_note(sensor.topic, *sensor.scales),)
+            notes += OdometryErrors(*sensor.scales).notes(sensor.topic)
         return notes
-
-
-def scales_note(topic: str, distance: float, turn: float) -> str:
-    """Describe the scales of an odometry that were found, and corrected.
-
-    Args:
-        topic: Where it comes from.
-        distance: The factor of its distances.
-        turn: That of its turns.
-
-    Returns:
-        A note.
-    """
-    return f"{topic}: distances x {distance:.3f}, turns x {turn:.3f}, found from the log and corrected"
 
 
 def _split_end_poses(queried: LaserPoses, scans: int) -> LaserPoses:

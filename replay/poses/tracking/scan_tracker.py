@@ -18,6 +18,7 @@ from prim import linear_algebra
 from prim.arrays import FloatArray, Stamps
 from prim.scan import PosedScan
 from prim.se2 import compose_poses, path_length, relative_poses, wrap_angles
+from replay.poses.odometry_errors import NO_ERRORS, OdometryErrors
 from replay.poses.scan_registration import range_noise
 from replay.poses.tracking.kernels import Window
 from replay.poses.tracking.local_map import LocalMap, Match, joined
@@ -41,6 +42,7 @@ class ScanTrack:
         fits: Whether scans fit well, and none is lost.
         overrules: Whether these poses are better than the odometry's: that stands still, or was often not followed,
             and scans fit well.
+        odometry_errors: What is wrong with the odometry all the time.
         errors: What is unsure about the poses; None where scans were not matched anew in the end.
     """
 
@@ -53,6 +55,7 @@ class ScanTrack:
     stands_still: bool = False
     fits: bool = True
     overrules: bool = False
+    odometry_errors: OdometryErrors = NO_ERRORS
     errors: TrackErrors | None = None
 
 
@@ -94,7 +97,7 @@ def track(
         stands_still,
         fits,
         is_wrong and fits,
-        tracker.errors() if noise_std < settled_noise else None,
+        errors=tracker.errors() if noise_std < settled_noise else None,
     )
 
 
