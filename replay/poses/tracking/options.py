@@ -50,7 +50,8 @@ class LocalMapOptions:
         turn: The step of headings (rad) in a search.
         kernel: Residuals lose weight beyond this (m): Welsch's function. It is wider at first.
         widening: By how much, in the first steps.
-        steps: Gauss and Newton's steps.
+        steps: Gauss and Newton's steps at most …
+        enough: … until one is shorter than this (m, half as much in rad).
         min_cosine: Points correspond where the cosine between their normals is no less.
         point_weight: Weight of points without a line, beside those on one.
         residual: Standard deviation of residuals (m) beside which a prior counts.
@@ -67,6 +68,7 @@ class LocalMapOptions:
     kernel: float = 0.05
     widening: tuple[float, ...] = (3.0, 3.0, 1.7, 1.7)
     steps: int = 10
+    enough: float = 2e-5
     min_cosine: float = 0.3
     point_weight: float = 0.15
     residual: float = 0.03
