@@ -1,7 +1,7 @@
-"""A lower bound on the errors of a session's poses where the map is not known: the Cramér-Rao bound of both together.
+"""A lower bound on the errors of a session's poses, the map being unknown: the Cramér-Rao bound of both together.
 
-A ray from the laser at p meets a surface at the range r, in the direction d and with the surface's unit normal n there.
-A small motion of the laser, and one v of the surface along its normal, change it by
+A ray from the laser at p meets a surface at the range r, in the direction d, where the unit normal is n. A small
+motion of the laser, and one v of the surface along its normal, change it by
 
     dr = (v - n·dp - r n·d' dθ) / n·d,        d' = d turned by a quarter.
 
@@ -14,13 +14,13 @@ What is unknown of the map is one of two:
 - SHAPES: that there are these primitives and straight walls is known, and where and how large they are is not: x, y,
   heading and sizes of each primitive, the offsets of both ends of each wall (and of each side of other things). No
   estimator without bias has smaller errors, but one that knows no shapes cannot reach it.
-- PATCHES: every outline is cut into patches of the length of a map's cell, each with an offset of its own along the
-  normal: what a map of cells knows of surfaces. It is a bound for estimators without knowledge of shapes.
+- PATCHES: every outline is cut into patches of the length of a map's cell, both of whose ends have offsets along the
+  normal: what a map of cells can know of surfaces. It is a bound for estimators without knowledge of shapes.
 
-Both take it as known which surface a ray meets. What rays say that change from hit to miss at a silhouette is left out:
-the likelihood is discontinuous there, and its information is that of the bounds of Weiss and Weinstein (see
-:mod:`bench.limit`). Where it counts, which it does the more the larger the noise is, errors may lie below this bound.
-Rays that graze a surface are left out too: how their range changes is linear only over less than the poses' errors.
+Both take it as known which surface a ray meets. What rays say that change from hit to miss at a silhouette is left
+out: the likelihood is discontinuous there, and its information is that of the bounds of Weiss and Weinstein (see
+:mod:`bench.limit`). Where it counts, the more the larger the noise is, errors may lie below this bound. Rays that
+graze a surface are left out too: how their range changes is linear only over less than the poses' errors.
 """
 
 from __future__ import annotations
@@ -194,17 +194,21 @@ def map_slopes(world: World, surfaces: Surfaces, hits: Hits, unknown: str) -> sp
 
 
 def _patch_slopes(surfaces: Surfaces, hits: Hits) -> sparse.csr_array:
-    """Return the derivatives of ranges by the offsets of patches."""
+    """Return the derivatives of ranges by the offsets of patches' ends."""
     lengths = np.hypot(*(surfaces.segments[:, 2:] - surfaces.segments[:, :2]).T)
     a, b = surfaces.ellipses[:, 3:].T
     around = math.pi * (3 * (a + b) - np.sqrt((3 * a + b) * (a + 3 * b)))  # Ramanujan's perimeter
     counts = np.maximum(np.round(np.concatenate((lengths, around)) / PATCH), 1).astype(np.int64)
     is_flat = hits.surface < len(lengths)
-    share = np.where(is_flat, hits.place, (hits.place / (2 * math.pi)) % 1)
-    within = np.minimum((share * counts[hits.surface]).astype(np.int64), counts[hits.surface] - 1)
-    column = np.cumsum(counts)[hits.surface] - counts[hits.surface] + within
-    rows = np.arange(len(column))
-    return sparse.csr_array((1 / hits.incidence, (rows, column)), shape=(len(rows), int(counts.sum())))
+    share = np.where(is_flat, hits.place, (hits.place / (2 * math.pi)) % 1) * counts[hits.surface]
+    begin = np.minimum(share.astype(np.int64), counts[hits.surface] - 1)
+    # a segment has a corner more than it has patches; around an ellipse the last patch ends where the first begins
+    end = np.where(is_flat, begin + 1, (begin + 1) % counts[hits.surface])
+    first = np.concatenate(([0], np.cumsum(counts + (np.arange(len(counts)) < len(lengths)))))
+    columns = first[hits.surface] + np.stack((begin, end))
+    values = np.stack((1 - share + begin, share - begin)) / hits.incidence
+    rows = np.tile(np.arange(len(hits.surface)), 2)
+    return sparse.csr_array((values.ravel(), (rows, columns.ravel())), shape=(len(hits.surface), int(first[-1])))
 
 
 def _shape_slopes(world: World, surfaces: Surfaces, hits: Hits) -> sparse.csr_array:

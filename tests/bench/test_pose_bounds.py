@@ -1,4 +1,4 @@
-"""The bound on errors of poses agrees with what is known by hand, with numeric derivatives, and with least squares."""
+"""The bound on errors of poses agrees with a value known by hand, numeric derivatives, and least squares."""
 
 from __future__ import annotations
 
@@ -67,7 +67,9 @@ def test_derivatives_are_those_of_the_ranges() -> None:
     for number, primitive in enumerate(WORLD.primitives):
         for name in primitive.kind.parameters:
             if name in primitive.sizes:
-                moved = replace(primitive, size=tuple((primitive.sizes | {name: primitive.sizes[name] + step}).values()))
+                moved = replace(
+                    primitive, size=tuple((primitive.sizes | {name: primitive.sizes[name] + step}).values())
+                )
             else:
                 moved = replace(primitive, **{name: getattr(primitive, name) + step})
             primitives = (*WORLD.primitives[:number], moved, *WORLD.primitives[number + 1 :])
