@@ -162,7 +162,7 @@ def localised(scans: list[Scan], poses: FloatArray) -> tuple[FloatArray, FloatAr
         mapper.accumulate(scan, pose)
     fit = mapper.fit()
     level, noise = fit_level(fit.stopping, fit.frame, rays_of(training))
-    likelihood = ScanLikelihood.of(fit, fit.noise)
+    likelihood = ScanLikelihood.of(fit, fit.noise, by_incidence=True)
     nats, moved = [], []
     for scan, start in items[::EVERY]:
         pose = localise(likelihood, scan, start)

@@ -749,8 +749,9 @@ def pose_likelihood(
 ) -> None:
     """Compute the log-likelihood of a scan from a pose of the robot, its gradient, and rays' outer products.
 
-    Derivatives are central differences. The outer products are those of single rays' gradients (Berndt, Hall, Hall
-    and Hausman 1974); the caller centres their sum. A ray that misses the grid counts as an outlier.
+    A ray's stopping probabilities are those of the direction next to its own. Derivatives are central differences.
+    The outer products are those of single rays' gradients (Berndt, Hall, Hall and Hausman 1974); the caller centres their
+    sum. A ray that misses the grid counts as an outlier.
 
     Args:
         rays: (N, 5) float64, in the frame of the laser: where each beam starts (x, y), its direction, its range (m).
@@ -758,14 +759,15 @@ def pose_likelihood(
         placement: The robot's pose (3,), the laser's pose in the robot's frame (3,), and the differences' steps (3,)
             in m, m, rad; where the steps are 0 the log-likelihood alone is computed.
         geometry: Fields of :class:`GridGeometry`.
-        stopping: Stopping probabilities (rows, cols) float32.
+        stopping: Stopping probabilities (directions, rows, cols) float32, of rays about the angles k pi / directions.
         sensor: Fields of :class:`SensorModel`.
         result: Filled (11,): log-likelihood, gradient (3), sums of the rays' outer products xx, xy, xt, yy, yt, tt,
             number of rays that cross the grid.
     """
     pose, mount, steps = placement
     grid = GridGeometry(*geometry)
-    scratch = make_scratch(stopping.shape[0], stopping.shape[1])
+    directions = stopping.shape[0]
+    scratch = make_scratch(stopping.shape[1], stopping.shape[2])
     per_metre, model = 1 / grid.resolution, in_cells(sensor, grid.resolution)
     cells = (limits[0] * per_metre, limits[1] * per_metre)
     gradient, places = np.empty(3), np.empty((7, 4))
@@ -776,13 +778,16 @@ def pose_likelihood(
     for i in range(len(rays)):
         here = 0.0
         counts = True
+        dx = places[0, 2] * rays[i, 2] - places[0, 3] * rays[i, 3]
+        dy = places[0, 3] * rays[i, 2] + places[0, 2] * rays[i, 3]
+        part = stopping[math.floor(math.atan2(dy, dx) / math.pi * directions + 0.5) % directions]
         for k in range(evaluations):
             cos, sin = places[k, 2], places[k, 3]
             x = places[k, 0] + (cos * rays[i, 0] - sin * rays[i, 1]) * per_metre
             y = places[k, 1] + (sin * rays[i, 0] + cos * rays[i, 1]) * per_metre
             dx, dy = cos * rays[i, 2] - sin * rays[i, 3], sin * rays[i, 2] + cos * rays[i, 3]
             ray = (x, y, dx, dy, rays[i, 4] * per_metre)
-            kind, count, _, _, _, _, _, density = trace_ray(ray, cells, stopping, 0, model, scratch)
+            kind, count, _, _, _, _, _, density = trace_ray(ray, cells, part, 0, model, scratch)
             if count < 0:
                 kind = classify_range(ray[4], cells[0], cells[1], model.sigma)[0]
                 density = model.epsilon * outlier_likelihood(kind, cells[0], cells[1], model.rays.outlier_tail)

@@ -14,6 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from mapping.forward.incidence import directional_stopping
 from mapping.forward.level import Level, RangeNoise, geometry_fields, sensor_fields
 from mapping.forward.likelihood import RayModel, pose_likelihood
 from mapping.forward.mapper import ForwardFit
@@ -126,7 +127,7 @@ class ScanLikelihood:
 
     Attributes:
         frame: Where the map's cells lie.
-        stopping: Stopping probabilities (rows, cols) float32.
+        stopping: Stopping probabilities (directions, rows, cols) float32, of rays about the angles k pi / directions.
         noise: The range noise.
         ray_model: The sensor model's parameters that are not estimated.
         options: The likelihood's options.
@@ -140,7 +141,11 @@ class ScanLikelihood:
 
     @classmethod
     def of(
-        cls, level: Level | ForwardFit, noise: RangeNoise, options: ScanLikelihoodOptions = POSE_DEFAULTS
+        cls,
+        level: Level | ForwardFit,
+        noise: RangeNoise,
+        options: ScanLikelihoodOptions = POSE_DEFAULTS,
+        by_incidence: bool = False,
     ) -> ScanLikelihood:
         """Return the likelihood under a level's or a fit's map.
 
@@ -148,12 +153,14 @@ class ScanLikelihood:
             level: The map.
             noise: The range noise; bounded by ``min_noise_cells``.
             options: The likelihood's options.
+            by_incidence: Whether rays that graze surfaces stop no sooner than others (see mapping.forward.incidence).
 
         Returns:
             The likelihood.
         """
+        stopping = directional_stopping(level.stopping) if by_incidence else level.stopping[None]
         std = max(noise.std, options.min_noise_cells * level.frame.resolution)
-        return cls(level.frame, level.stopping, noise._replace(std=std), options=options)
+        return cls(level.frame, stopping, noise._replace(std=std), options=options)
 
     def derivatives(
         self, scan: ScanRays, pose: FloatArray, mount: FloatArray, noise_scale: float = 1.0

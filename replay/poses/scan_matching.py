@@ -47,8 +47,11 @@ from replay.poses.laser_poses import LaserPoses, PosedScanSource
 class ScanMatchingOptions:
     """The numbers of scan matching; set by hand."""
 
-    max_rays: int = 180
+    max_rays: int = 360
     """At most so many rays of a scan are matched, evenly spread."""
+
+    smoothing: float = 0.0
+    """Of the maps that scans are matched with (see ForwardOptions)."""
 
     map_cells: int = 1_000_000
     """The growing map has cells of twice the resolution, or larger ones where it would have more cells than this."""
@@ -227,7 +230,7 @@ class ScanMatcher:
         before: _State | None = None  # that of the round before, smoothed by a map of all
         for number in range(max_rounds):
             fit = self._mapper_of_scans().fit()
-            likelihood = ScanLikelihood.of(fit, fit.noise)
+            likelihood = ScanLikelihood.of(fit, fit.noise, by_incidence=True)
             noise_scale = noise_scale or self._first_noise_scale(pose_error, likelihood)
             mean, terms = self._match_all(likelihood, noise_scale)
             if before is not None and noise_scale == 1.0:
@@ -265,7 +268,7 @@ class ScanMatcher:
         return min(float((corrections**2 / variances).mean()), self._options.max_inflation)
 
     def _new_mapper(self) -> ForwardMapper:
-        options = ForwardOptions(streaming_cells=self._options.map_cells)
+        options = ForwardOptions(streaming_cells=self._options.map_cells, smoothing=self._options.smoothing)
         return ForwardMapper(self._resolution, self._bounds, self._noise_std, options=options)
 
     def _mapper_of_scans(self) -> ForwardMapper:
