@@ -1,0 +1,134 @@
+"""Loops of a track: found in the order of time, then anew in rounds, with the pose graph that they close."""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from prim.arrays import FloatArray
+from replay.poses.loops.candidates import Candidate, MotionCovariances, candidates, round_candidates
+from replay.poses.loops.consistency import supported
+from replay.poses.loops.graph_edges import joined_edges, step_edges
+from replay.poses.loops.kernels import EdgeArrays
+from replay.poses.loops.loop_search import Loop, LoopSearch, Rejection
+from replay.poses.loops.options import DEFAULTS, LoopOptions
+from replay.poses.loops.pose_graph import GEMAN_MCCLURE, HUBER, PoseGraph, RobustLoss
+from replay.poses.loops.submaps import Keyframes, Submaps
+
+
+@dataclass(frozen=True)
+class ClosedLoops:
+    """The loops of a track, and the poses that fit them.
+
+    Attributes:
+        poses: (N, 3) of the keyframes.
+        loops: The loops that are relied upon.
+        rejected: How many matches were rejected, by the reason.
+        graph: The pose graph; its poses are these.
+    """
+
+    poses: FloatArray
+    loops: tuple[Loop, ...]
+    rejected: dict[Rejection, int]
+    graph: PoseGraph
+
+
+class LoopCloser:
+    """Finds and closes the loops of a track.
+
+    Args:
+        keyframes: The track's keyframes.
+        options: Windows, limits, the pose graph.
+    """
+
+    def __init__(self, keyframes: Keyframes, options: LoopOptions = DEFAULTS) -> None:
+        self._keyframes, self._options = keyframes, options
+        self._pieces = keyframes.pieces
+        self._steps = step_edges(keyframes, options.graph)
+        self._poses = keyframes.poses.copy()
+        self._loops: list[Loop] = []
+        self._rejected: Counter[Rejection] = Counter()
+
+    def run(self) -> ClosedLoops | None:
+        """Find and close loops; None where there are none."""
+        self._sweep()
+        if not self._loops:
+            return None
+        for _ in range(self._options.rounds):
+            self._search_anew()
+        graph = self._optimise(GEMAN_MCCLURE)
+        weights = graph.weights[len(self._steps[1]) :]
+        kept = tuple(loop for loop, w in zip(self._loops, weights, strict=True) if w >= self._options.least_weight)
+        self._rejected[Rejection.OUTLIER] += len(self._loops) - len(kept)
+        return ClosedLoops(self._poses, kept, dict(self._rejected), graph)
+
+    def _sweep(self) -> None:
+        """Search in the order of time; loops that others agree with are closed on the way."""
+        options = self._options
+        search = LoopSearch(Submaps(self._keyframes, self._poses, options), options)
+        covariances = MotionCovariances(self._poses, self._graph().factor())
+        pending: list[Loop] = []
+        new = 0
+        for chunk in range(options.gap, len(self._poses), options.every):
+            wanted = candidates(chunk, self._poses, covariances, options)
+            pending += self._searched(search, wanted)
+            sure = supported(pending, self._poses, self._pieces, options)
+            self._loops += [loop for loop, is_sure in zip(pending, sure, strict=True) if is_sure]
+            new += int(sure.sum())
+            pending = [loop for loop, is_sure in zip(pending, sure, strict=True) if not is_sure]
+            old = [loop for loop in pending if chunk - loop.last > options.support_keyframes]
+            self._rejected[Rejection.UNSUPPORTED] += len(old)
+            pending = [loop for loop in pending if chunk - loop.last <= options.support_keyframes]
+            if new >= options.optimise_after:
+                covariances, new = self._closed(), 0
+        self._rejected[Rejection.UNSUPPORTED] += len(pending)
+        if new:
+            self._closed()
+
+    def _closed(self) -> MotionCovariances:
+        graph = self._optimise(HUBER)
+        return MotionCovariances(self._poses, graph.factor())
+
+    def _searched(self, search: LoopSearch, wanted: list[Candidate]) -> list[Loop]:
+        found = []
+        for candidate in wanted:
+            loop = search.find(candidate)
+            if isinstance(loop, Rejection):
+                self._rejected[loop] += 1
+            elif loop is not None:
+                found.append(loop)
+        return found
+
+    def _search_anew(self) -> None:
+        """Search for all loops in the poses as they are."""
+        search = LoopSearch(Submaps(self._keyframes, self._poses, self._options), self._options)
+        self._loops = self._searched(search, round_candidates(self._poses, self._options))
+        self._optimise(GEMAN_MCCLURE)
+
+    def _graph(self) -> PoseGraph:
+        edges, robust = self._steps
+        if self._loops:
+            edges = joined_edges([edges, _edges(self._loops)])
+            robust = np.concatenate((robust, np.ones(len(self._loops), bool)))
+        return PoseGraph(self._poses, edges, robust, self._options.graph)
+
+    def _optimise(self, loss: RobustLoss) -> PoseGraph:
+        graph = self._graph()
+        graph.optimise(loss)
+        self._poses[:] = graph.poses
+        return graph
+
+
+def _edges(loops: list[Loop]) -> EdgeArrays:
+    def nodes(name: str) -> NDArray[np.intp]:
+        return np.array([getattr(loop, name) for loop in loops], np.intp)
+
+    return EdgeArrays(
+        nodes("first"),
+        nodes("last"),
+        np.array([loop.motion for loop in loops]),
+        np.array([loop.information for loop in loops]),
+    )
