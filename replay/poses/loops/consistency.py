@@ -1,4 +1,4 @@
-"""Whether loops agree with those of neighbouring keyframes: one alone is not relied upon."""
+"""Whether loops agree with those of neighbouring keyframes, since one alone is not relied upon; what they connect."""
 
 from __future__ import annotations
 
@@ -61,3 +61,38 @@ def supported(
     agrees = agreeing(loops, poses, pieces, options)
     last = np.array([loop.last for loop in loops])
     return np.array([len(np.unique(last[row])) >= options.support for row in agrees])
+
+
+def count_stretches(loops: Sequence[Loop], most_apart: int) -> int:
+    """Count loops as people do: those of neighbouring keyframes are one.
+
+    Args:
+        loops: The loops between single keyframes.
+        most_apart: Loops whose keyframes are no further apart, at both ends, belong together.
+
+    Returns:
+        How many there are.
+    """
+    ends = np.array([(loop.first, loop.last) for loop in loops]).reshape(-1, 2)
+    groups = np.arange(len(ends))
+    for k, end in enumerate(ends):
+        near = np.unique(groups[: k + 1][np.abs(ends[: k + 1] - end).max(axis=1) <= most_apart])
+        groups[np.isin(groups, near)] = near[0]
+    return len(np.unique(groups))
+
+
+def connected(loops: Sequence[Loop], pieces: NDArray[np.intp]) -> NDArray[np.intp]:
+    """Find what loops connect.
+
+    Args:
+        loops: The loops.
+        pieces: (N,) the piece of the track that each keyframe belongs to.
+
+    Returns:
+        (N,) the lowest number of the pieces that each keyframe's is connected with.
+    """
+    joint = pieces.copy()
+    for loop in loops:
+        a, b = sorted((joint[loop.first], joint[loop.last]))
+        joint[joint == b] = a
+    return joint

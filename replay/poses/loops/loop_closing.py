@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from prim.arrays import FloatArray
 from replay.poses.loops.candidates import Candidate, MotionCovariances, candidates, round_candidates
-from replay.poses.loops.consistency import supported
+from replay.poses.loops.consistency import connected, count_stretches, supported
 from replay.poses.loops.graph_edges import joined_edges, step_edges
 from replay.poses.loops.kernels import EdgeArrays
 from replay.poses.loops.loop_search import Loop, LoopSearch, Rejection
@@ -25,14 +25,18 @@ class ClosedLoops:
 
     Attributes:
         poses: (N, 3) of the keyframes.
-        loops: The loops that are relied upon.
-        rejected: How many matches were rejected, by the reason.
+        loops: The recognised keyframes that are relied upon.
+        closed: How many loops they close: stretches of neighbouring keyframes that recognise each other.
+        rejected: How many recognised keyframes were rejected, by the reason.
+        connected: (N,) equal numbers for keyframes that the track or loops connect.
         graph: The pose graph; its poses are these.
     """
 
     poses: FloatArray
     loops: tuple[Loop, ...]
+    closed: int
     rejected: dict[Rejection, int]
+    connected: NDArray[np.intp]
     graph: PoseGraph
 
 
@@ -52,18 +56,23 @@ class LoopCloser:
         self._loops: list[Loop] = []
         self._rejected: Counter[Rejection] = Counter()
 
-    def run(self) -> ClosedLoops | None:
-        """Find and close loops; None where there are none."""
+    def run(self) -> ClosedLoops:
+        """Find and close loops.
+
+        Returns:
+            What was found; the poses are those of the track where there are none.
+        """
         self._sweep()
-        if not self._loops:
-            return None
-        for _ in range(self._options.rounds):
-            self._search_anew()
+        rejected = self._rejected.copy()  # a round finds the same ones again
+        if self._loops:
+            for _ in range(self._options.rounds):
+                self._search_anew()
         graph = self._optimise(GEMAN_MCCLURE)
         weights = graph.weights[len(self._steps[1]) :]
-        kept = tuple(loop for loop, w in zip(self._loops, weights, strict=True) if w >= self._options.least_weight)
-        self._rejected[Rejection.OUTLIER] += len(self._loops) - len(kept)
-        return ClosedLoops(self._poses, kept, dict(self._rejected), graph)
+        kept = [loop for loop, w in zip(self._loops, weights, strict=True) if w >= self._options.least_weight]
+        rejected[Rejection.OUTLIER] += len(self._loops) - len(kept)
+        count = count_stretches(kept, self._options.support_keyframes)
+        return ClosedLoops(self._poses, tuple(kept), count, dict(+rejected), connected(kept, self._pieces), graph)
 
     def _sweep(self) -> None:
         """Search in the order of time; loops that others agree with are closed on the way."""

@@ -10,6 +10,7 @@ import numpy as np
 from prim.arrays import FloatArray
 from prim.se2 import Trajectory, compose_poses, inverse_poses, path_length, wrap_angles
 from replay.poses.laser_poses import SCANS, LaserPoses, PosedScanSource, ScanTimes
+from replay.poses.loops.loop_closing import ClosedLoops
 from replay.poses.tracking.options import DEFAULTS, TrackingOptions
 from replay.poses.tracking.scan_tracker import ScanTrack, track
 
@@ -121,4 +122,23 @@ def track_notes(found: ScanTrack, odometry: LaserPoses | None, times: ScanTimes)
             f"{len(found.broken)} {what} nowhere near those before, the first one number {found.broken[0]}: "
             "what lies before and after may not belong together"
         )
+    if found.closed is not None:
+        notes += loop_notes(found.closed)
     return tuple(notes)
+
+
+def loop_notes(closed: ClosedLoops) -> list[str]:
+    """Return what a user should know of loops.
+
+    Args:
+        closed: Those that were closed, and how many recognised places were rejected.
+
+    Returns:
+        A note; none where nothing was recognised.
+    """
+    rejected = {reason.value: count for reason, count in closed.rejected.items()}
+    if not closed.closed and not rejected:
+        return []
+    what = {0: "no loop closed", 1: "1 loop closed"}.get(closed.closed, f"{closed.closed} loops closed")
+    reasons = ", ".join(f"{count} rejected as {reason}" for reason, count in sorted(rejected.items()))
+    return [f"{what}, {reasons}" if reasons else what]

@@ -105,6 +105,8 @@ class TrackingOptions:
         widest: The largest window in place (m).
         settled_rounds: Rounds in which all scans are matched anew with those before and after them.
         block: Keyframes that share a map in these.
+        near: Where loops were closed, keyframes within this distance (m) share it as well …
+        most_near: … the nearest so many.
         surfel: Points within so much (m) of each other become one in these maps.
         settled_std: Standard deviation of the prior around a scan's pose in a round (m, rad).
         least_std: Standard deviations of a match (m, rad) beside those that its residuals have: what a map of few
@@ -149,6 +151,8 @@ class TrackingOptions:
     widest: float = 6.0
     settled_rounds: int = 2
     block: int = 5
+    near: float = 6.0
+    most_near: int = 60
     surfel: float = 0.05
     settled_std: tuple[float, float] = (0.02, math.radians(0.3))
     least_std: tuple[float, float] = (0.0015, math.radians(0.06))
