@@ -13,7 +13,7 @@ from replay.poses.loops.block_cholesky import BlockCholesky
 from replay.poses.loops.options import LoopOptions
 
 
-class Candidate(NamedTuple):
+class LoopCandidate(NamedTuple):
     """A submap that a chunk may lie in.
 
     Attributes:
@@ -74,7 +74,7 @@ def _slopes(frames: FloatArray, pose: FloatArray) -> tuple[FloatArray, FloatArra
 
 def candidates(
     chunk: int, poses: FloatArray, covariances: MotionCovariances, options: LoopOptions
-) -> list[Candidate]:
+) -> list[LoopCandidate]:
     """Choose the submaps of earlier keyframes that a chunk may lie in, by the covariance of the motion from these.
 
     Args:
@@ -103,10 +103,10 @@ def candidates(
             chosen.append(k)
         if len(chosen) >= (options.wide_per_chunk if reach[k] > options.distance / 2 else options.per_chunk):
             break
-    return [Candidate(chunk, int(submaps[k]), motions[k], float(reach[k]), float(turn[k])) for k in chosen]
+    return [LoopCandidate(chunk, int(submaps[k]), motions[k], float(reach[k]), float(turn[k])) for k in chosen]
 
 
-def round_candidates(poses: FloatArray, options: LoopOptions) -> list[Candidate]:
+def round_candidates(poses: FloatArray, options: LoopOptions) -> list[LoopCandidate]:
     """Choose all submaps near all chunks, once loops are closed.
 
     Args:
@@ -130,7 +130,7 @@ def round_candidates(poses: FloatArray, options: LoopOptions) -> list[Candidate]
                 break
         motions = relative_poses(poses[submaps[chosen]], np.repeat(poses[chunk : chunk + 1], len(chosen), axis=0))
         found += [
-            Candidate(chunk, int(submaps[k]), motion, *options.least_window)
+            LoopCandidate(chunk, int(submaps[k]), motion, *options.least_window)
             for k, motion in zip(chosen, motions, strict=True)
         ]
     return sorted(found, key=lambda one: one.submap)

@@ -39,7 +39,7 @@ def agreeing(
     agrees = (np.hypot(apart[:, 0], apart[:, 1]) < limit) & (np.abs(wrap_angles(apart[:, 2])) < turn)
     agrees &= (pieces[last[a]] == pieces[last[b]]) & (last[a] != last[b])
     agrees &= np.abs(last[a] - last[b]) <= options.support_keyframes
-    return agrees.reshape(count, count)
+    return np.asarray(agrees.reshape(count, count))
 
 
 def supported(

@@ -16,8 +16,8 @@ from replay.poses.loops.submaps import Keyframes
 def step_edges(keyframes: Keyframes, options: GraphOptions) -> tuple[EdgeArrays, NDArray[np.bool_]]:
     """Join each keyframe with some of those before it, by how scans matched.
 
-    Where a wide search found the step, this is a robust edge beside a weak one, and no other edge spans it; where a scan
-    fitted nowhere, there is the weak one alone.
+    Where a wide search found the step, this is a robust edge beside a weak one, and no other edge spans it; where a
+    scan fitted nowhere, there is the weak one alone.
 
     Args:
         keyframes: The keyframes.
@@ -37,7 +37,8 @@ def step_edges(keyframes: Keyframes, options: GraphOptions) -> tuple[EdgeArrays,
         usable = whole & ((unsure[first] == unsure[last]) | (lag == 1))
         parts.append(_matched_edges(keyframes, first[usable], last[usable], options))
         robust.append((unsure[first] != unsure[last])[usable])
-    for chosen, std in ((keyframes.unsure & ~keyframes.broken, options.unsure_std), (keyframes.broken, options.broken_std)):
+    found = keyframes.unsure & ~keyframes.broken
+    for chosen, std in ((found, options.unsure_std), (keyframes.broken, options.broken_std)):
         last = numbers[1:][chosen[1:]]
         parts.append(_weak_edges(keyframes, last - 1, last, std, options))
         robust.append(np.zeros(len(last), bool))

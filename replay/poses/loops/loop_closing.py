@@ -9,11 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from prim.arrays import FloatArray
-from replay.poses.loops.candidates import Candidate, MotionCovariances, candidates, round_candidates
+from replay.poses.loops.candidates import LoopCandidate, MotionCovariances, candidates, round_candidates
 from replay.poses.loops.consistency import connected, count_stretches, supported
 from replay.poses.loops.graph_edges import joined_edges, step_edges
 from replay.poses.loops.kernels import EdgeArrays
-from replay.poses.loops.loop_search import Loop, LoopSearch, Rejection
+from replay.poses.loops.loop_search import Loop, LoopRejection, LoopSearch
 from replay.poses.loops.options import DEFAULTS, LoopOptions
 from replay.poses.loops.pose_graph import GEMAN_MCCLURE, HUBER, PoseGraph, RobustLoss
 from replay.poses.loops.submaps import Keyframes, Submaps
@@ -35,7 +35,7 @@ class ClosedLoops:
     poses: FloatArray
     loops: tuple[Loop, ...]
     closed: int
-    rejected: dict[Rejection, int]
+    rejected: dict[LoopRejection, int]
     connected: NDArray[np.intp]
     graph: PoseGraph
 
@@ -54,7 +54,7 @@ class LoopCloser:
         self._steps = step_edges(keyframes, options.graph)
         self._poses = keyframes.poses.copy()
         self._loops: list[Loop] = []
-        self._rejected: Counter[Rejection] = Counter()
+        self._rejected: Counter[LoopRejection] = Counter()
 
     def run(self) -> ClosedLoops:
         """Find and close loops.
@@ -70,7 +70,7 @@ class LoopCloser:
         graph = self._optimise(GEMAN_MCCLURE)
         weights = graph.weights[len(self._steps[1]) :]
         kept = [loop for loop, w in zip(self._loops, weights, strict=True) if w >= self._options.least_weight]
-        rejected[Rejection.OUTLIER] += len(self._loops) - len(kept)
+        rejected[LoopRejection.OUTLIER] += len(self._loops) - len(kept)
         count = count_stretches(kept, self._options.support_keyframes)
         return ClosedLoops(self._poses, tuple(kept), count, dict(+rejected), connected(kept, self._pieces), graph)
 
@@ -89,11 +89,11 @@ class LoopCloser:
             new += int(sure.sum())
             pending = [loop for loop, is_sure in zip(pending, sure, strict=True) if not is_sure]
             old = [loop for loop in pending if chunk - loop.last > options.support_keyframes]
-            self._rejected[Rejection.UNSUPPORTED] += len(old)
+            self._rejected[LoopRejection.UNSUPPORTED] += len(old)
             pending = [loop for loop in pending if chunk - loop.last <= options.support_keyframes]
             if new >= options.optimise_after:
                 covariances, new = self._closed(), 0
-        self._rejected[Rejection.UNSUPPORTED] += len(pending)
+        self._rejected[LoopRejection.UNSUPPORTED] += len(pending)
         if new:
             self._closed()
 
@@ -101,11 +101,11 @@ class LoopCloser:
         graph = self._optimise(HUBER)
         return MotionCovariances(self._poses, graph.factor())
 
-    def _searched(self, search: LoopSearch, wanted: list[Candidate]) -> list[Loop]:
+    def _searched(self, search: LoopSearch, wanted: list[LoopCandidate]) -> list[Loop]:
         found = []
         for candidate in wanted:
             loop = search.find(candidate)
-            if isinstance(loop, Rejection):
+            if isinstance(loop, LoopRejection):
                 self._rejected[loop] += 1
             elif loop is not None:
                 found.append(loop)

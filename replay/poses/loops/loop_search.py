@@ -11,7 +11,7 @@ import numpy as np
 from prim import linear_algebra
 from prim.arrays import FloatArray
 from prim.se2 import relative_poses, wrap_angles
-from replay.poses.loops.candidates import Candidate
+from replay.poses.loops.candidates import LoopCandidate
 from replay.poses.loops.graph_edges import edge_covariance
 from replay.poses.loops.options import LoopOptions
 from replay.poses.loops.submaps import Submaps
@@ -19,7 +19,7 @@ from replay.poses.tracking.kernels import Excluded, Window
 from replay.poses.tracking.local_map import LocalMap, Match
 
 
-class Rejection(Enum):
+class LoopRejection(Enum):
     """Why a match is no loop."""
 
     AMBIGUOUS = "ambiguous"
@@ -59,7 +59,7 @@ class LoopSearch:
         place, turn = options.start_std
         self._prior = np.diag([place**-2, place**-2, turn**-2])
 
-    def find(self, candidate: Candidate) -> Loop | Rejection | None:
+    def find(self, candidate: LoopCandidate) -> Loop | LoopRejection | None:
         """Search for a chunk in a submap.
 
         Args:
@@ -82,27 +82,28 @@ class LoopSearch:
         if match.score < options.least_score or away > options.most_fitted:
             return None
         if candidate.reach > options.wide and not self._is_unique(candidate, chunk, submap, match, found[1]):
-            return Rejection.AMBIGUOUS
+            return LoopRejection.AMBIGUOUS
         if self._score_back(candidate, match) < options.least_back:
-            return Rejection.ONE_SIDED
+            return LoopRejection.ONE_SIDED
         return self._loop(candidate, match)
 
     def _is_unique(
-        self, candidate: Candidate, chunk: FloatArray, submap: LocalMap, match: Match, score: float
+        self, candidate: LoopCandidate, chunk: FloatArray, submap: LocalMap, match: Match, score: float
     ) -> bool:
         """Tell whether a chunk lies nowhere else in the window, nor in its own surroundings as far around."""
         options = self._options
         levels, floor = self._levels(candidate.reach), options.second_share * score
         window = Window(candidate.reach, candidate.turn, options.turn, 0.0, 0.0)
-        here = Excluded(*match.pose.tolist(), *options.apart)
+        x, y, heading = match.pose.tolist()
+        here = Excluded(x, y, heading, *options.apart)
         if submap.find(chunk, candidate.guess, window, levels, floor, here) is not None:
             return False
         own = self._submaps.surroundings(candidate.chunk, candidate.reach)
         home = Excluded(0.0, 0.0, 0.0, *options.apart)
         return own is None or own.find(chunk, np.zeros(3), window, levels, floor, home) is None
 
-    def _score_back(self, candidate: Candidate, match: Match) -> float:
-        """Return how well the chunk of the submap that is nearest to where a chunk was found fits that one's submap."""
+    def _score_back(self, candidate: LoopCandidate, match: Match) -> float:
+        """Return how well the submap's chunk that is nearest to where another was found fits that one's submap."""
         poses, half = self._submaps.poses, self._options.half_submap
         around = np.arange(max(candidate.submap - half, 0), min(candidate.submap + half + 1, len(poses)))
         frame = np.repeat(poses[candidate.submap : candidate.submap + 1], len(around), axis=0)
@@ -114,7 +115,7 @@ class LoopSearch:
         back = relative_poses(match.pose[None], seen[nearest : nearest + 1])[0]
         return own.score(self._submaps.chunk(int(around[nearest])), back)
 
-    def _loop(self, candidate: Candidate, match: Match) -> Loop:
+    def _loop(self, candidate: LoopCandidate, match: Match) -> Loop:
         graph = self._options.graph
         spread = edge_covariance(match.information, np.eye(3), graph.loop_share, graph.loop_std)
         information = linear_algebra.inverse(spread)

@@ -72,7 +72,7 @@ class LoopOptions:
         reach: Points further than this (m) from the laser are left out.
         half_submap: A submap has so many keyframes before and after its middle …
         half_chunk: … a chunk so many.
-        most_surroundings: Where a window is wide, the chunk is searched for in its own surroundings as well, of at most
+        most_surroundings: Where a window is wide, the chunk is searched for in its own surroundings as well: at most
             so many keyframes before and after it.
         least_points: A chunk has no fewer points than this.
         kept_submaps: So many submaps are kept in memory.

@@ -99,7 +99,7 @@ def _is_excluded(x: float, y: float, heading: float, excluded: Any) -> bool:
     if not (x - excluded.x) ** 2 + (y - excluded.y) ** 2 < excluded.reach * abs(excluded.reach):
         return False
     turn = heading - excluded.heading
-    return abs(turn - 2.0 * math.pi * math.floor((turn + math.pi) / (2.0 * math.pi))) < excluded.turn
+    return bool(abs(turn - 2.0 * math.pi * math.floor((turn + math.pi) / (2.0 * math.pi))) < excluded.turn)
 
 
 @inline

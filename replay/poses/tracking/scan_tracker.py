@@ -207,9 +207,10 @@ class ScanTracker:
                 self._matches[number] = match
 
     def _around(self, block: range, piece: range) -> list[int]:
-        """Return the keyframes that some keyframes are matched with: those around them in time and, by loops, place."""
+        """Return the keyframes that some are matched with: those around them in time and, by loops, in place."""
         options = self.options
-        last = range(max(block.start - options.keyframes, piece.start), min(block.stop + options.keyframes, piece.stop))
+        before, after = block.start - options.keyframes, block.stop + options.keyframes
+        last = range(max(before, piece.start), min(after, piece.stop))
         if self.closed is None or not self.closed.loops:
             return list(last)
         poses = self.poses[self.keyframes]
