@@ -110,6 +110,14 @@ def normal_equations(
 
 
 @inline
+def _take_product(a: Any, b: Any, out: Any) -> None:
+    """Subtract from a matrix (3, M) the product of one (3, 3) and one (3, M)."""
+    for i in range(3):
+        for j in range(out.shape[1]):
+            out[i, j] -= a[i, 0] * b[0, j] + a[i, 1] * b[1, j] + a[i, 2] * b[2, j]
+
+
+@inline
 def _inverse_root(a: Any, out: Any) -> bool:
     """Invert the lower Cholesky factor (3, 3) of a matrix; False where that is not positive definite."""
     if not a[0, 0] > 0.0:
@@ -158,13 +166,7 @@ def factorise(pattern: Any, diagonal: Any, below: Any, roots: Any, factor: Any) 
         while k != -1:
             following, own = link[k], at[k]
             for e in range(own, starts[k + 1]):
-                row = rows[e]
-                for a in range(3):
-                    for b in range(3):
-                        total = 0.0
-                        for c in range(3):
-                            total += factor[e, a, c] * factor[own, b, c]
-                        work[row, a, b] -= total
+                _take_product(factor[e], factor[own].T, work[rows[e]])
             at[k] = own + 1
             if at[k] < starts[k + 1]:
                 row = rows[at[k]]
@@ -190,15 +192,21 @@ def substitute(pattern: Any, roots: Any, factor: Any, right: Any) -> None:
         factor: (K, 3, 3).
         right: (N, 3, M) the right hand sides, changed to the solutions.
     """
-    starts, rows, count = pattern.starts, pattern.rows, len(roots)
+    starts, rows, count, width = pattern.starts, pattern.rows, len(roots), right.shape[2]
     for j in range(count):
-        right[j] = roots[j] @ right[j]
+        for c in range(width):
+            a, b, d = right[j, 0, c], right[j, 1, c], right[j, 2, c]
+            for k in range(3):
+                right[j, k, c] = roots[j, k, 0] * a + roots[j, k, 1] * b + roots[j, k, 2] * d
         for e in range(starts[j], starts[j + 1]):
-            right[rows[e]] -= factor[e] @ right[j]
+            _take_product(factor[e], right[j], right[rows[e]])
     for j in range(count - 1, -1, -1):
         for e in range(starts[j], starts[j + 1]):
-            right[j] -= factor[e].T @ right[rows[e]]
-        right[j] = roots[j].T @ right[j]
+            _take_product(factor[e].T, right[rows[e]], right[j])
+        for c in range(width):
+            a, b, d = right[j, 0, c], right[j, 1, c], right[j, 2, c]
+            for k in range(3):
+                right[j, k, c] = roots[j, 0, k] * a + roots[j, 1, k] * b + roots[j, 2, k] * d
 
 
 @kernel
@@ -223,13 +231,13 @@ def selected_inverse(pattern: Any, roots: Any, factor: Any, diagonal: Any, below
             below[e] = 0.0
         for e in range(begin, end):
             k = rows[e]
-            below[e] -= diagonal[k] @ unit[e - begin]
+            _take_product(diagonal[k], unit[e - begin], below[e])
             for f in range(starts[k], starts[k + 1]):
                 s = slot[rows[f]]
                 if s >= 0:
-                    below[s] -= below[f] @ unit[e - begin]
-                    below[e] -= below[f].T @ unit[s - begin]
+                    _take_product(below[f], unit[e - begin], below[s])
+                    _take_product(below[f].T, unit[s - begin], below[e])
         diagonal[j] = roots[j].T @ roots[j]
         for e in range(begin, end):
-            diagonal[j] -= unit[e - begin].T @ below[e]
+            _take_product(unit[e - begin].T, below[e], diagonal[j])
             slot[rows[e]] = -1

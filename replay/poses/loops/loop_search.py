@@ -10,7 +10,7 @@ import numpy as np
 
 from prim import linear_algebra
 from prim.arrays import FloatArray
-from prim.se2 import relative_poses, wrap_angles
+from prim.se2 import compose_poses, relative_poses, wrap_angles
 from replay.poses.loops.candidates import LoopCandidate
 from replay.poses.loops.graph_edges import edge_covariance
 from replay.poses.loops.options import LoopOptions
@@ -109,11 +109,13 @@ class LoopSearch:
         frame = np.repeat(poses[candidate.submap : candidate.submap + 1], len(around), axis=0)
         seen = relative_poses(frame, poses[around])
         nearest = int(np.argmin(np.hypot(*(seen[:, :2] - match.pose[:2]).T)))
-        own = self._submaps.submap(candidate.chunk)
+        home = self._submaps.middle_near(candidate.chunk)
+        own = self._submaps.submap(home)
         if own is None:
             return 0.0
-        back = relative_poses(match.pose[None], seen[nearest : nearest + 1])[0]
-        return own.score(self._submaps.chunk(int(around[nearest])), back)
+        back = relative_poses(match.pose[None], seen[nearest : nearest + 1])
+        offset = relative_poses(poses[home : home + 1], poses[candidate.chunk : candidate.chunk + 1])
+        return own.score(self._submaps.chunk(int(around[nearest])), compose_poses(offset, back)[0])
 
     def _loop(self, candidate: LoopCandidate, match: Match) -> Loop:
         graph = self._options.graph

@@ -75,7 +75,8 @@ class LoopOptions:
         most_surroundings: Where a window is wide, the chunk is searched for in its own surroundings as well: at most
             so many keyframes before and after it.
         least_points: A chunk has no fewer points than this.
-        kept_submaps: So many submaps are kept in memory.
+        kept_submaps: So many submaps are kept in memory …
+        kept_chunks: … and so many chunks.
         every: Each so many keyframes a chunk is searched for.
         gap: Keyframes that are closer than so many in time make no loop.
         distance: Chunks are searched for in submaps within this distance (m), and within the window.
@@ -117,6 +118,7 @@ class LoopOptions:
     most_surroundings: int = 40
     least_points: int = 60
     kept_submaps: int = 16
+    kept_chunks: int = 500
     every: int = 4
     gap: int = 30
     distance: float = 3.0

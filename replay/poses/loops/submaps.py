@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -55,15 +55,27 @@ class Submaps:
         self._options, self._pieces = options, keyframes.pieces
         self._points = [self._within_reach(points) for points in keyframes.points]
         self._kept: dict[tuple[int, int], LocalMap] = {}
+        self._chunks: dict[int, FloatArray] = {}
 
     def chunk(self, middle: int) -> FloatArray:
         """Return the points (M, 4) of a keyframe and its neighbours."""
         options = self._options
-        return thinned(self._joined(middle, self._around(middle, options.half_chunk)), options.chunk_spacing)
+        if middle not in self._chunks:
+            around = self._joined(middle, self._around(middle, options.half_chunk))
+            self._chunks[middle] = thinned(around, options.chunk_spacing)
+            if len(self._chunks) > options.kept_chunks:
+                self._chunks.pop(next(iter(self._chunks)))
+        return self._chunks[middle]
 
     def submap(self, middle: int) -> LocalMap | None:
         """Return the map of a keyframe and its neighbours; None where they have no points."""
         return self._map(middle, self._options.half_submap)
+
+    def middle_near(self, number: int) -> int:
+        """Return the keyframe of its piece that has a submap in common with others, and is nearest in time."""
+        spacing = self._options.half_submap
+        middle = min(round(number / spacing) * spacing, len(self._points) - 1)
+        return middle if self._pieces[middle] == self._pieces[number] else number
 
     def surroundings(self, middle: int, reach: float) -> LocalMap | None:
         """Return the map of a keyframe and of those before and after it whose scans reach as far as a window.
@@ -91,23 +103,19 @@ class Submaps:
         points = self._joined(middle, self._around(middle, half))
         if not len(points):
             return None
-        self._kept[key] = LocalMap(thinned(points, self._options.map.cell / 2), self._options.map)
+        self._kept[key] = LocalMap(points, self._options.map)
         if len(self._kept) > self._options.kept_submaps:
             self._kept.pop(next(iter(self._kept)))
         return self._kept[key]
 
-    def _around(self, middle: int, half: int) -> Iterable[int]:
-        numbers = range(max(0, middle - half), min(len(self._points), middle + half + 1))
-        return [number for number in numbers if self._pieces[number] == self._pieces[middle]]
+    def _around(self, middle: int, half: int) -> NDArray[np.intp]:
+        numbers = np.arange(max(0, middle - half), min(len(self._points), middle + half + 1))
+        return numbers[self._pieces[numbers] == self._pieces[middle]]
 
-    def _joined(self, middle: int, numbers: Iterable[int]) -> FloatArray:
-        frame = self.poses[middle : middle + 1]
-        return joined(
-            [
-                moved(self._points[number], relative_poses(frame, self.poses[number : number + 1])[0])
-                for number in numbers
-            ]
-        )
+    def _joined(self, middle: int, numbers: NDArray[np.intp]) -> FloatArray:
+        frames = np.repeat(self.poses[middle : middle + 1], len(numbers), axis=0)
+        places = relative_poses(frames, self.poses[numbers])
+        return joined([moved(self._points[k], place) for k, place in zip(numbers.tolist(), places, strict=True)])
 
     def _within_reach(self, points: FloatArray) -> FloatArray:
         near = np.hypot(points[:, 0], points[:, 1]) < self._options.reach
