@@ -84,9 +84,7 @@ def ring(
     walls = []
     for corners in (outer, inner):
         for a, b in zip(corners, corners[1:] + corners[:1], strict=True):
-            walls += (
-                niched(b, a, niches(math.dist(a, b))) if corners is outer else niched(b, a, niches(math.dist(a, b)))
-            )
+            walls += niched(b, a, niches(math.dist(a, b)))
     corners = [(0.0, 0.0), (w, 0.0), (w, h), (0.0, h)]
     begin = (rng.uniform(4, 26), 0.0)
     way = [begin, *corners[1:], corners[0]]
@@ -100,6 +98,11 @@ def ring(
 def block(rng: np.random.Generator) -> Building:
     """A loop of 100 m, and some metres of it again."""
     return ring(rng, lambda length: random_niches(length, rng), 1.1)
+
+
+def even_block(rng: np.random.Generator) -> Building:
+    """The same, whose sides and corners look alike."""
+    return ring(rng, lambda length: even_niches(length, 4.0), 1.2)
 
 
 def open_block(rng: np.random.Generator) -> Building:
@@ -147,12 +150,16 @@ def serpentine(rng: np.random.Generator) -> Building:
 
 BUILDINGS: dict[str, Callable[[np.random.Generator], Building]] = {
     "a loop of 100 m": block,
+    "the same, sides alike": even_block,
     "corridor without doors": lambda rng: corridor(rng, None),
     "corridor, doors alike": lambda rng: corridor(rng, 4.0),
     "rooms alike": rooms,
     "parallel corridors alike": serpentine,
     "three sides alike": open_block,
 }
+
+
+WITH_LOOPS = ("a loop of 100 m", "the same, sides alike")
 
 
 def driven(way: list[tuple[float, float]]) -> FloatArray:
@@ -235,7 +242,7 @@ def rows(seeds: int) -> Iterator[str]:
     yield "| building | poses | logs | RMSE, mm: mean, worst | loops a log | wrong loops | rejected a log | CPU, s |"
     yield "|---|---|---:|---:|---:|---:|---:|---:|"
     for name, (label, known) in itertools.product(BUILDINGS, (("odometry", True), ("scans alone", False))):
-        count = seeds if name == "a loop of 100 m" else max(seeds // (len(BUILDINGS) - 1), 1)
+        count = seeds if name in WITH_LOOPS else max(seeds // (len(BUILDINGS) - len(WITH_LOOPS)), 1)
         results = [tracked(name, seed, known) for seed in range(count)]
         rmse, loops, wrong, rejected, seconds = (np.array(column) for column in zip(*results, strict=True))
         yield (

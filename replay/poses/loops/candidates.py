@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import numpy as np
@@ -11,6 +12,7 @@ from prim.arrays import FloatArray
 from prim.se2 import relative_poses
 from replay.poses.loops.block_cholesky import BlockCholesky
 from replay.poses.loops.options import LoopOptions
+from replay.poses.loops.submaps import Submaps
 
 
 class LoopCandidate(NamedTuple):
@@ -73,37 +75,60 @@ def _slopes(frames: FloatArray, pose: FloatArray) -> tuple[FloatArray, FloatArra
 
 
 def candidates(
-    chunk: int, poses: FloatArray, covariances: MotionCovariances, options: LoopOptions
+    chunk: int, submaps: Submaps, covariances: MotionCovariances, options: LoopOptions
 ) -> list[LoopCandidate]:
     """Choose the submaps of earlier keyframes that a chunk may lie in, by the covariance of the motion from these.
 
+    Submaps from which that says next to nothing, since the track was lost between, are chosen by their signatures.
+
     Args:
         chunk: The keyframe in the middle of the chunk.
-        poses: (N, 3) of the keyframes.
-        covariances: Of the motions between them.
+        submaps: The submaps.
+        covariances: Of the motions between keyframes.
         options: Distances and windows.
 
     Returns:
         The candidates, the nearest first, none beside another.
     """
-    submaps = np.arange(options.half_submap, chunk - options.gap, options.half_submap)
-    if not len(submaps):
+    middles = np.arange(options.half_submap, chunk - options.gap, options.half_submap)
+    if not len(middles):
         return []
-    spread = covariances.to(chunk, submaps)
+    poses, spread = submaps.poses, covariances.to(chunk, middles)
     place = options.deviations * np.sqrt(largest_variance(spread))
     turn = options.deviations * np.sqrt(spread[:, 2, 2])
+    lost = (place > options.lost_window[0]) | (turn > options.lost_window[1])
     reach = np.clip(place, options.least_window[0], options.most_window[0])
     turn = np.clip(turn, options.least_window[1], options.most_window[1])
-    motions = relative_poses(poses[submaps], np.repeat(poses[chunk : chunk + 1], len(submaps), axis=0))
+    motions = relative_poses(poses[middles], np.repeat(poses[chunk : chunk + 1], len(middles), axis=0))
     away = np.hypot(motions[:, 0], motions[:, 1])
-    near = np.flatnonzero(away < options.distance + reach)
+    near = np.flatnonzero((away < options.distance + reach) & ~lost)
+    most = options.wide_per_chunk if (reach[near] > options.distance / 2).any() else options.per_chunk
+    chosen = _apart(near[np.argsort(away[near])], most)
+    found = [LoopCandidate(chunk, int(middles[k]), motions[k], float(reach[k]), float(turn[k])) for k in chosen]
+    if lost.any() and chunk % options.lost_every == 0:
+        found += _lost_candidates(chunk, submaps, middles[lost], options)
+    return found
+
+
+def _lost_candidates(
+    chunk: int, submaps: Submaps, middles: NDArray[np.intp], options: LoopOptions
+) -> list[LoopCandidate]:
+    """Choose submaps that look most like the one around a chunk, to be searched in all headings."""
+    own = submaps.signature(submaps.middle_near(chunk))
+    different = np.array([np.abs(submaps.signature(int(middle)) - own).sum() for middle in middles])
+    return [
+        LoopCandidate(chunk, int(middles[k]), np.zeros(3), options.most_window[0], math.pi)
+        for k in np.argsort(different, kind="stable")[: options.lost_per_chunk]
+    ]
+
+
+def _apart(numbers: NDArray[np.intp], most: int) -> list[int]:
+    """Return the first of some numbers, none next to another, at most so many."""
     chosen: list[int] = []
-    for k in near[np.argsort(away[near])].tolist():
-        if all(abs(k - other) >= 2 for other in chosen):
+    for k in numbers.tolist():
+        if len(chosen) < most and all(abs(k - other) >= 2 for other in chosen):
             chosen.append(k)
-        if len(chosen) >= (options.wide_per_chunk if reach[k] > options.distance / 2 else options.per_chunk):
-            break
-    return [LoopCandidate(chunk, int(submaps[k]), motions[k], float(reach[k]), float(turn[k])) for k in chosen]
+    return chosen
 
 
 def round_candidates(poses: FloatArray, options: LoopOptions) -> list[LoopCandidate]:
@@ -122,12 +147,7 @@ def round_candidates(poses: FloatArray, options: LoopOptions) -> list[LoopCandid
         away = np.hypot(*(poses[submaps, :2] - poses[chunk, :2]).T)
         apart = np.abs(submaps - chunk) > 2 * options.half_submap + options.half_chunk
         near = np.flatnonzero((away < options.round_distance) & apart)
-        chosen: list[int] = []
-        for k in near[np.argsort(away[near])].tolist():
-            if all(abs(k - other) >= 2 for other in chosen):
-                chosen.append(k)
-            if len(chosen) >= options.round_per_chunk:
-                break
+        chosen = _apart(near[np.argsort(away[near])], options.round_per_chunk)
         motions = relative_poses(poses[submaps[chosen]], np.repeat(poses[chunk : chunk + 1], len(chosen), axis=0))
         found += [
             LoopCandidate(chunk, int(submaps[k]), motion, *options.least_window)

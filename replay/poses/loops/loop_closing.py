@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections import Counter
 from dataclasses import dataclass
 
@@ -9,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from prim.arrays import FloatArray
+from prim.se2 import compose_poses, relative_poses
 from replay.poses.loops.candidates import LoopCandidate, MotionCovariances, candidates, round_candidates
 from replay.poses.loops.consistency import connected, count_stretches, supported
 from replay.poses.loops.graph_edges import joined_edges, step_edges
@@ -77,25 +79,40 @@ class LoopCloser:
     def _sweep(self) -> None:
         """Search in the order of time; loops that others agree with are closed on the way."""
         options = self._options
-        search = LoopSearch(Submaps(self._keyframes, self._poses, options), options)
+        submaps = Submaps(self._keyframes, self._poses, options)
+        search = LoopSearch(submaps, options)
         covariances = MotionCovariances(self._poses, self._graph().factor())
         pending: list[Loop] = []
         new = 0
-        for chunk in range(options.gap, len(self._poses), options.every):
-            wanted = candidates(chunk, self._poses, covariances, options)
-            pending += self._searched(search, wanted)
+        for chunk in range(options.every * math.ceil(options.gap / options.every), len(self._poses), options.every):
+            pending += self._searched(search, candidates(chunk, submaps, covariances, options))
             sure = supported(pending, self._poses, self._pieces, options)
-            self._loops += [loop for loop, is_sure in zip(pending, sure, strict=True) if is_sure]
-            new += int(sure.sum())
+            added = [loop for loop, is_sure in zip(pending, sure, strict=True) if is_sure]
             pending = [loop for loop, is_sure in zip(pending, sure, strict=True) if not is_sure]
-            old = [loop for loop in pending if chunk - loop.last > options.support_keyframes]
-            self._rejected[LoopRejection.UNSUPPORTED] += len(old)
-            pending = [loop for loop in pending if chunk - loop.last <= options.support_keyframes]
-            if new >= options.optimise_after:
+            recent = [loop for loop in pending if chunk - loop.last <= options.support_keyframes]
+            self._rejected[LoopRejection.UNSUPPORTED] += len(pending) - len(recent)
+            pending, new, joins = recent, new + len(added), self._join_pieces(added)
+            self._loops += added
+            if joins or new >= options.optimise_after:
                 covariances, new = self._closed(), 0
         self._rejected[LoopRejection.UNSUPPORTED] += len(pending)
         if new:
             self._closed()
+
+    def _join_pieces(self, added: list[Loop]) -> bool:
+        """Move pieces of the track that loops join first to where these put them; tell whether there are any."""
+        joins = False
+        for k, loop in enumerate(added):
+            joint = connected([*self._loops, *added[:k]], self._pieces)
+            if joint[loop.first] == joint[loop.last]:
+                continue
+            later = np.flatnonzero(self._pieces >= self._pieces[loop.last])
+            to = compose_poses(self._poses[loop.first : loop.first + 1], loop.motion[None])
+            last = np.repeat(self._poses[loop.last : loop.last + 1], len(later), axis=0)
+            seen = relative_poses(last, self._poses[later])
+            self._poses[later] = compose_poses(np.repeat(to, len(later), axis=0), seen)
+            joins = True
+        return joins
 
     def _closed(self) -> MotionCovariances:
         graph = self._optimise(HUBER)

@@ -79,7 +79,8 @@ class LoopSearch:
             return None
         match = submap.match(chunk, found[0], None, self._prior)
         away = math.hypot(*(match.pose - found[0])[:2])
-        if match.score < options.least_score or away > options.most_fitted:
+        lowest = options.lost_score if candidate.turn >= math.pi else options.least_score
+        if match.score < lowest or away > options.most_fitted:
             return None
         if candidate.reach > options.wide and not self._is_unique(candidate, chunk, submap, match, found[1]):
             return LoopRejection.AMBIGUOUS

@@ -85,6 +85,13 @@ class LoopOptions:
         deviations: A window reaches so many standard deviations of the motion between the two keyframes …
         least_window: … and no less than this (m, rad) …
         most_window: … and no more.
+        lost_window: Where so many standard deviations reach further than this (m, rad), the track was lost between:
+            the submaps are searched that look most like the one around the chunk …
+        lost_every: … at each so many keyframes, a multiple of ``every`` …
+        lost_per_chunk: … so many of them …
+        lost_score: … and what is found must have this score at least.
+        rings: They look alike where as many points lie in rings around their middle of this width (m) …
+        ring_count: … so many of these.
         wide: A window that reaches further than this (m) is wide: what is found must be unique in it.
         turn: The step of headings (rad).
         levels: Levels of the search by the reach of the window (m) up to which they suffice.
@@ -127,6 +134,12 @@ class LoopOptions:
     deviations: float = 4.0
     least_window: tuple[float, float] = (0.3, math.radians(4))
     most_window: tuple[float, float] = (5.0, math.radians(40))
+    lost_window: tuple[float, float] = (8.0, math.radians(80))
+    lost_every: int = 4
+    lost_per_chunk: int = 4
+    lost_score: float = 0.65
+    rings: float = 0.5
+    ring_count: int = 24
     wide: float = 0.6
     turn: float = math.radians(1.0)
     levels: tuple[tuple[float, int], ...] = ((0.4, 2), (1.5, 4))
@@ -143,7 +156,7 @@ class LoopOptions:
     agreement: tuple[float, float] = (0.15, math.radians(2.5))
     agreement_per_metre: float = 0.02
     optimise_after: int = 25
-    rounds: int = 2
+    rounds: int = 1
     round_every: int = 2
     round_distance: float = 4.0
     round_per_chunk: int = 4

@@ -56,6 +56,7 @@ class Submaps:
         self._points = [self._within_reach(points) for points in keyframes.points]
         self._kept: dict[tuple[int, int], LocalMap] = {}
         self._chunks: dict[int, FloatArray] = {}
+        self._signatures: dict[int, FloatArray] = {}
 
     def chunk(self, middle: int) -> FloatArray:
         """Return the points (M, 4) of a keyframe and its neighbours."""
@@ -95,6 +96,16 @@ class Submaps:
         last = int(after[0]) - 1 if len(after) else len(near) - 1
         return self._map(middle, min(max(half, middle - first, last - middle), self._options.most_surroundings))
 
+    def signature(self, middle: int) -> FloatArray:
+        """Return the shares (R,) of a submap's points that lie in rings around its middle, whatever its heading."""
+        options = self._options
+        if middle not in self._signatures:
+            points = thinned(self._joined(middle, self._around(middle, options.half_submap)), options.chunk_spacing)
+            rings = (np.hypot(points[:, 0], points[:, 1]) / options.rings).astype(int)
+            counts = np.bincount(rings[rings < options.ring_count], minlength=options.ring_count)
+            self._signatures[middle] = counts / max(counts.sum(), 1)
+        return self._signatures[middle]
+
     def _map(self, middle: int, half: int) -> LocalMap | None:
         key = middle, half
         if key in self._kept:
@@ -110,7 +121,7 @@ class Submaps:
 
     def _around(self, middle: int, half: int) -> NDArray[np.intp]:
         numbers = np.arange(max(0, middle - half), min(len(self._points), middle + half + 1))
-        return numbers[self._pieces[numbers] == self._pieces[middle]]
+        return np.asarray(numbers[self._pieces[numbers] == self._pieces[middle]])
 
     def _joined(self, middle: int, numbers: NDArray[np.intp]) -> FloatArray:
         frames = np.repeat(self.poses[middle : middle + 1], len(numbers), axis=0)
