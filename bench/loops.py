@@ -204,9 +204,8 @@ def wrong_loops(found: ScanTrack, true: FloatArray) -> int:
     first, last = (frames[[getattr(loop, end) for loop in found.closed.loops]] for end in ("first", "last"))
     motions = np.array([loop.motion for loop in found.closed.loops])
     apart = motions - relative_poses(true[first], true[last])
-    return int(
-        ((np.hypot(apart[:, 0], apart[:, 1]) > WRONG[0]) | (np.abs(wrap_angles(apart[:, 2])) > WRONG[1])).sum()
-    )
+    is_far, is_turned = np.hypot(apart[:, 0], apart[:, 1]) > WRONG[0], np.abs(wrap_angles(apart[:, 2])) > WRONG[1]
+    return int((is_far | is_turned).sum())
 
 
 class Result(NamedTuple):
@@ -246,8 +245,8 @@ def rows(seeds: int) -> Iterator[str]:
         results = [tracked(name, seed, known) for seed in range(count)]
         rmse, loops, wrong, rejected, seconds = (np.array(column) for column in zip(*results, strict=True))
         yield (
-            f"| {name} | {label} | {count} | {1000 * rmse.mean():.0f}, {1000 * rmse.max():.0f} | {loops.mean():.1f} | "
-            f"{wrong.sum()} | {rejected.mean():.1f} | {seconds.mean():.1f} |"
+            f"| {name} | {label} | {count} | {1000 * rmse.mean():.0f}, {1000 * rmse.max():.0f} | "
+            f"{loops.mean():.1f} | {wrong.sum()} | {rejected.mean():.1f} | {seconds.mean():.1f} |"
         )
 
 

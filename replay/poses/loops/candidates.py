@@ -145,7 +145,7 @@ def round_candidates(poses: FloatArray, options: LoopOptions) -> list[LoopCandid
     found = []
     for chunk in range(0, len(poses), options.round_every):
         away = np.hypot(*(poses[submaps, :2] - poses[chunk, :2]).T)
-        apart = np.abs(submaps - chunk) > 2 * options.half_submap + options.half_chunk
+        apart = np.abs(submaps - chunk) > options.gap
         near = np.flatnonzero((away < options.round_distance) & apart)
         chosen = _apart(near[np.argsort(away[near])], options.round_per_chunk)
         motions = relative_poses(poses[submaps[chosen]], np.repeat(poses[chunk : chunk + 1], len(chosen), axis=0))
