@@ -64,16 +64,17 @@ def supported(
 
 
 def count_stretches(loops: Sequence[Loop], most_apart: int) -> int:
-    """Count loops as people do: those of neighbouring keyframes are one.
+    """Count loops as people do: those of neighbouring keyframes are one, and those between neighbours none.
 
     Args:
         loops: The loops between single keyframes.
-        most_apart: Loops whose keyframes are no further apart, at both ends, belong together.
+        most_apart: Keyframes that are no further apart are neighbours.
 
     Returns:
         How many there are.
     """
-    ends = np.array([(loop.first, loop.last) for loop in loops]).reshape(-1, 2)
+    ends = np.sort(np.array([(loop.first, loop.last) for loop in loops]).reshape(-1, 2), axis=1)
+    ends = ends[ends[:, 1] - ends[:, 0] > most_apart]
     groups = np.arange(len(ends))
     for k, end in enumerate(ends):
         near = np.unique(groups[: k + 1][np.abs(ends[: k + 1] - end).max(axis=1) <= most_apart])

@@ -108,7 +108,8 @@ class TrackingOptions:
         near: Where loops were closed, keyframes within this distance (m) share it as well …
         most_near: … the nearest so many.
         surfel: Points within so much (m) of each other become one in these maps.
-        settled_std: Standard deviation of the prior around a scan's pose in a round (m, rad).
+        settled_std: Standard deviation of the prior around a scan's pose in a round (m, rad) …
+        closed_std: … and where loops were closed: their graph says where scans are.
         least_std: Standard deviations of a match (m, rad) beside those that its residuals have: what a map of few
             scans has of its own; by halves of the beams of two buildings (bench/poses.py).
         first_std: Those of the first pose, which is known.
@@ -155,6 +156,7 @@ class TrackingOptions:
     most_near: int = 60
     surfel: float = 0.05
     settled_std: tuple[float, float] = (0.02, math.radians(0.3))
+    closed_std: tuple[float, float] = (0.01, math.radians(0.15))
     least_std: tuple[float, float] = (0.0015, math.radians(0.06))
     first_std: float = 1e-5
     coarse_cells: float = 0.02

@@ -198,7 +198,7 @@ class ScanTracker:
         if not len(points):
             return
         local = LocalMap(points, options.map)
-        place, turn = options.settled_std
+        place, turn = options.settled_std if self._is_open else options.closed_std
         prior = np.diag([place**-2, place**-2, turn**-2])
         for number in range(begin, end):
             if len(self.points[number]):
@@ -211,13 +211,18 @@ class ScanTracker:
         options = self.options
         before, after = block.start - options.keyframes, block.stop + options.keyframes
         last = range(max(before, piece.start), min(after, piece.stop))
-        if self.closed is None or not self.closed.loops:
+        if self.closed is None or self._is_open:
             return list(last)
         poses = self.poses[self.keyframes]
         away = np.hypot(*(poses[:, :2] - poses[block].mean(axis=0)[:2]).T)
         away[self.closed.connected != self.closed.connected[block.start]] = np.inf
         nearest = np.argsort(away, kind="stable")[: options.most_near]
         return sorted({*last, *nearest[away[nearest] < options.near].tolist()})
+
+    @property
+    def _is_open(self) -> bool:
+        """Whether no loop was closed so far."""
+        return self.closed is None or not self.closed.loops
 
     def close_loops(self) -> None:
         """Find loops among the keyframes; where there are some, move all scans with these, and match them anew."""
