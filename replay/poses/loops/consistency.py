@@ -92,8 +92,9 @@ def connected(loops: Sequence[Loop], pieces: NDArray[np.intp]) -> NDArray[np.int
     Returns:
         (N,) the lowest number of the pieces that each keyframe's is connected with.
     """
-    joint = pieces.copy()
-    for loop in loops:
-        a, b = sorted((joint[loop.first], joint[loop.last]))
-        joint[joint == b] = a
-    return joint
+    numbers = np.arange(pieces[-1] + 1)
+    ends = np.array([(loop.first, loop.last) for loop in loops], np.intp).reshape(-1, 2)
+    for pair in np.unique(pieces[ends], axis=0):
+        a, b = np.sort(numbers[pair])
+        numbers[numbers == b] = a
+    return np.asarray(numbers[pieces])

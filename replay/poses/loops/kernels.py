@@ -94,19 +94,28 @@ def normal_equations(
         right: (N, 3) gets the negative gradient.
     """
     residual, by_first, by_last = np.empty(3), np.empty((3, 3)), np.empty((3, 3))
+    of_first, of_last = np.empty((3, 3)), np.empty((3, 3))  # less the products of information and slopes
     diagonal[:] = 0.0
     below[:] = 0.0
     right[:] = 0.0
     for k in range(len(edges.first)):
         i, j = pattern.places[edges.first[k]], pattern.places[edges.last[k]]
         _differ(poses[edges.first[k]], poses[edges.last[k]], edges.motions[k], residual, by_first, by_last)
-        weighted = weights[k] * edges.information[k]
-        of_first, of_last, of_residual = weighted @ by_first, weighted @ by_last, weighted @ residual
-        diagonal[i] += by_first.T @ of_first
-        diagonal[j] += by_last.T @ of_last
-        below[slots[k]] += by_last.T @ of_first if i < j else by_first.T @ of_last
-        right[i] -= by_first.T @ of_residual
-        right[j] -= by_last.T @ of_residual
+        of_first[:], of_last[:] = 0.0, 0.0
+        _take_product(edges.information[k], by_first, of_first)
+        _take_product(edges.information[k], by_last, of_last)
+        of_first *= weights[k]
+        of_last *= weights[k]
+        _take_product(by_first.T, of_first, diagonal[i])
+        _take_product(by_last.T, of_last, diagonal[j])
+        if i < j:
+            _take_product(by_last.T, of_first, below[slots[k]])
+        else:
+            _take_product(by_first.T, of_last, below[slots[k]])
+        for a in range(3):
+            for b in range(3):
+                right[i, a] += of_first[b, a] * residual[b]
+                right[j, a] += of_last[b, a] * residual[b]
 
 
 @inline

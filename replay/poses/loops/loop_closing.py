@@ -69,7 +69,7 @@ class LoopCloser:
         if self._loops:
             for _ in range(self._options.rounds):
                 self._search_anew()
-        graph = self._optimise(GEMAN_MCCLURE)
+        graph = self._optimise(GEMAN_MCCLURE) if self._loops else self._graph()
         weights = graph.weights[len(self._steps[1]) :]
         kept = [loop for loop, w in zip(self._loops, weights, strict=True) if w >= self._options.least_weight]
         rejected[LoopRejection.OUTLIER] += len(self._loops) - len(kept)
@@ -93,7 +93,7 @@ class LoopCloser:
             self._rejected[LoopRejection.UNSUPPORTED] += len(pending) - len(recent)
             pending, new, joins = recent, new + len(added), self._join_pieces(added)
             self._loops += added
-            if joins or new >= options.optimise_after:
+            if joins or new >= max(options.optimise_after, options.optimise_share * len(self._loops)):
                 covariances, new = self._closed(), 0
         self._rejected[LoopRejection.UNSUPPORTED] += len(pending)
         if new:
@@ -102,6 +102,8 @@ class LoopCloser:
     def _join_pieces(self, added: list[Loop]) -> bool:
         """Move pieces of the track that loops join first to where these put them; tell whether there are any."""
         joins = False
+        if not self._pieces[-1]:
+            return False
         for k, loop in enumerate(added):
             joint = connected([*self._loops, *added[:k]], self._pieces)
             if joint[loop.first] == joint[loop.last]:

@@ -107,7 +107,8 @@ class LoopOptions:
         support: … so many others must agree …
         agreement: … within this (m, rad) …
         agreement_per_metre: … and this share of the way between them.
-        optimise_after: The graph is optimised after so many new loops.
+        optimise_after: The graph is optimised after so many new loops …
+        optimise_share: … and this share of all before, so that the time grows in proportion to the log.
         rounds: Rounds in which all loops are searched for anew, in the poses of the last.
         round_every: Each so many keyframes in these …
         round_distance: … within this distance (m) …
@@ -156,6 +157,7 @@ class LoopOptions:
     agreement: tuple[float, float] = (0.15, math.radians(2.5))
     agreement_per_metre: float = 0.02
     optimise_after: int = 25
+    optimise_share: float = 0.05
     rounds: int = 1
     round_every: int = 2
     round_distance: float = 4.0
