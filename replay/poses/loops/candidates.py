@@ -97,6 +97,7 @@ def candidates(
     place = options.deviations * np.sqrt(largest_variance(spread))
     turn = options.deviations * np.sqrt(spread[:, 2, 2])
     lost = (place > options.lost_window[0]) | (turn > options.lost_window[1])
+    lost &= submaps.pieces[middles] != submaps.pieces[chunk]
     reach = np.clip(place, options.least_window[0], options.most_window[0])
     turn = np.clip(turn, options.least_window[1], options.most_window[1])
     motions = relative_poses(poses[middles], np.repeat(poses[chunk : chunk + 1], len(middles), axis=0))

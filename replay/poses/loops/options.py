@@ -85,8 +85,8 @@ class LoopOptions:
         deviations: A window reaches so many standard deviations of the motion between the two keyframes …
         least_window: … and no less than this (m, rad) …
         most_window: … and no more.
-        lost_window: Where so many standard deviations reach further than this (m, rad), the track was lost between:
-            the submaps are searched that look most like the one around the chunk …
+        lost_window: Where so many standard deviations reach further than this (m, rad), and the track was lost
+            between, the submaps are searched that look most like the one around the chunk …
         lost_every: … at each so many keyframes, a multiple of ``every`` …
         lost_per_chunk: … so many of them …
         lost_score: … and what is found must have this score at least.
@@ -120,12 +120,12 @@ class LoopOptions:
     map: LocalMapOptions = field(default_factory=LocalMapOptions)
     spacing: float = 0.06
     chunk_spacing: float = 0.1
-    reach: float = 20.0
+    reach: float = 12.0
     half_submap: int = 10
     half_chunk: int = 5
     most_surroundings: int = 40
     least_points: int = 60
-    kept_submaps: int = 16
+    kept_submaps: int = 32
     kept_chunks: int = 500
     every: int = 4
     gap: int = 30

@@ -51,8 +51,8 @@ class Submaps:
     """
 
     def __init__(self, keyframes: Keyframes, poses: FloatArray, options: LoopOptions) -> None:
-        self.poses = poses
-        self._options, self._pieces = options, keyframes.pieces
+        self.poses, self.pieces = poses, keyframes.pieces
+        self._options = options
         self._points = [self._within_reach(points) for points in keyframes.points]
         self._kept: dict[tuple[int, int], LocalMap] = {}
         self._chunks: dict[int, FloatArray] = {}
@@ -76,7 +76,7 @@ class Submaps:
         """Return the keyframe of its piece that has a submap in common with others, and is nearest in time."""
         spacing = self._options.half_submap
         middle = min(round(number / spacing) * spacing, len(self._points) - 1)
-        return middle if self._pieces[middle] == self._pieces[number] else number
+        return middle if self.pieces[middle] == self.pieces[number] else number
 
     def surroundings(self, middle: int, reach: float) -> LocalMap | None:
         """Return the map of a keyframe and of those before and after it whose scans reach as far as a window.
@@ -121,7 +121,7 @@ class Submaps:
 
     def _around(self, middle: int, half: int) -> NDArray[np.intp]:
         numbers = np.arange(max(0, middle - half), min(len(self._points), middle + half + 1))
-        return np.asarray(numbers[self._pieces[numbers] == self._pieces[middle]])
+        return np.asarray(numbers[self.pieces[numbers] == self.pieces[middle]])
 
     def _joined(self, middle: int, numbers: NDArray[np.intp]) -> FloatArray:
         frames = np.repeat(self.poses[middle : middle + 1], len(numbers), axis=0)
