@@ -40,10 +40,10 @@ class GraphOptions:
     lags: tuple[int, ...] = (1, 4, 10)
     step_share: float = 0.1
     step_std: tuple[float, float] = (0.005, math.radians(0.1))
-    step_factor: float = 2.0
+    step_factor: float = 1.5
     step_growth: float = 0.1
     loop_share: float = 0.05
-    loop_std: tuple[float, float] = (0.015, math.radians(0.3))
+    loop_std: tuple[float, float] = (0.012, math.radians(0.25))
     motion_std: tuple[float, float] = (0.5, 0.3)
     odometry_std: tuple[float, float] = (0.1, 0.1)
     unsure_std: tuple[float, float] = (1.5, 0.7)
@@ -159,7 +159,7 @@ class LoopOptions:
     optimise_after: int = 25
     optimise_share: float = 0.05
     rounds: int = 1
-    round_every: int = 2
+    round_every: int = 3
     round_distance: float = 4.0
     round_per_chunk: int = 4
     least_weight: float = 0.25

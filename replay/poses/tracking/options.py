@@ -103,7 +103,8 @@ class TrackingOptions:
         broken: A scan of a lower score after all that stands where it was predicted, and a new map begins.
         wide_window: How far a lost scan is searched for (m, rad).
         widest: The largest window in place (m).
-        settled_rounds: Rounds in which all scans are matched anew with those before and after them.
+        settled_rounds: Rounds in which all scans are matched anew with those before and after them …
+        closed_rounds: … and with those that are near once loops are closed.
         block: Keyframes that share a map in these.
         near: Where loops were closed, keyframes within this distance (m) share it as well …
         most_near: … the nearest so many.
@@ -151,6 +152,7 @@ class TrackingOptions:
     wide_window: tuple[float, float] = (1.0, math.radians(60))
     widest: float = 6.0
     settled_rounds: int = 2
+    closed_rounds: int = 1
     block: int = 5
     near: float = 6.0
     most_near: int = 60

@@ -181,7 +181,7 @@ class ScanTracker:
         """Match all scans anew, some times, with the keyframes before and after them and, by loops, near them."""
         starts = [0, *(self.keyframes.index(number) for number in self.broken)]
         pieces = list(zip(starts, [*starts[1:], len(self.keyframes)], strict=True))  # what is lost begins anew
-        for _ in range(self.options.settled_rounds):
+        for _ in range(self.options.settled_rounds if self._is_open else self.options.closed_rounds):
             settled = self.poses.copy()
             for start, stop in pieces:
                 for first in range(start, stop, self.options.block):
