@@ -9,7 +9,7 @@ import numpy as np
 
 from prim.arrays import FloatArray
 from prim.se2 import Trajectory, compose_poses, inverse_poses, path_length, wrap_angles
-from replay.poses.laser_poses import SCANS, LaserPoses, PosedScanSource, ScanTimes
+from replay.poses.laser_poses import SCANS, LaserPoses, LoopCounts, PosedScanSource, ScanTimes
 from replay.poses.loops.loop_closing import ClosedLoops
 from replay.poses.tracking.options import DEFAULTS, TrackingOptions
 from replay.poses.tracking.scan_tracker import ScanTrack, track
@@ -70,6 +70,8 @@ def _tracked(
     several = mounts if len(times.frame_ids) > 1 else poses.mounts
     valid = poses.valid & within[:count]
     placed = replace(poses, poses=whole, end_poses=ends, valid=valid, mounts=several)
+    if found.closed is not None:
+        placed = replace(placed, loops=LoopCounts(found.closed.closed, rejected_counts(found.closed)))
     if found.errors is not None:
         turn = _turned_by(lasers[0, 2])
         nearest = np.clip(np.searchsorted(times.stamps[at], times.stamps), 0, len(at) - 1)
@@ -136,9 +138,21 @@ def loop_notes(closed: ClosedLoops) -> list[str]:
     Returns:
         A note; none where nothing was recognised.
     """
-    rejected = {reason.value: count for reason, count in closed.rejected.items()}
+    rejected = rejected_counts(closed)
     if not closed.closed and not rejected:
         return []
     what = {0: "no loop closed", 1: "1 loop closed"}.get(closed.closed, f"{closed.closed} loops closed")
-    reasons = ", ".join(f"{count} rejected as {reason}" for reason, count in sorted(rejected.items()))
+    reasons = ", ".join(f"{count} rejected as {reason}" for reason, count in rejected.items())
     return [f"{what}, {reasons}" if reasons else what]
+
+
+def rejected_counts(closed: ClosedLoops) -> dict[str, int]:
+    """Return how many recognised keyframes were rejected, by the reason, in the order of the alphabet.
+
+    Args:
+        closed: The loops.
+
+    Returns:
+        The counts, none of them 0.
+    """
+    return dict(sorted((reason.value, count) for reason, count in closed.rejected.items()))
