@@ -68,7 +68,22 @@ def score(
     Returns:
         The mean log-likelihood of a held-out ray (nats), and the standard deviation of the fitted noise (m).
     """
-    best = (-np.inf, 0.0, 0.0)
+    level, noise = fit_level(stopping, frame, training)
+    return level.expect(held_out, noise)[1].mean_log_likelihood, noise.std
+
+
+def fit_level(stopping: NDArray[np.float32], frame: GridFrame, training: RayStore) -> tuple[Level, RangeNoise]:
+    """Fit the clipping of a map, and the noise, to the rays that it is made of.
+
+    Args:
+        stopping: The map (rows, cols), taken as stopping probabilities.
+        frame: Its frame.
+        training: The rays.
+
+    Returns:
+        The clipped map, and the noise.
+    """
+    best: tuple[float, Level, RangeNoise] | None = None
     for clip in CLIPS:
         level, noise = Level(frame, 0.5), RangeNoise(0.1, 0.01)
         level.set_parameters(np.clip(stopping, clip, 1 - clip).astype(np.float32))
@@ -76,8 +91,9 @@ def score(
             _, statistics = level.expect(training, noise)
             noise = statistics.range_noise(noise, frame.resolution)
         fit = level.expect(training, noise)[1].mean_log_likelihood
-        if fit > best[0]:
-            best = fit, level.expect(held_out, noise)[1].mean_log_likelihood, noise.std
+        if best is None or fit > best[0]:
+            best = fit, level, noise
+    assert best is not None
     return best[1], best[2]
 
 

@@ -79,11 +79,15 @@ def replay(
     odom_topic: Annotated[str | None, typer.Option(metavar="T", help="The topic of odometry or poses.")] = None,
     fuse: Annotated[
         str | None,
-        typer.Option(metavar="odom,gps,compass", help="The sensors to fuse. [default: all available]"),
+        typer.Option(metavar="odom,gps,compass,imu", help="The sensors to fuse. [default: all available]"),
     ] = None,
     gps_topic: Annotated[str | None, typer.Option(metavar="T", help="The topic of position fixes.")] = None,
     compass_topic: Annotated[
         str | None, typer.Option(metavar="T", help="The topic of vectors that point north.")
+    ] = None,
+    imu_topic: Annotated[
+        str | None,
+        typer.Option(metavar="TOPIC", help="Topic of an IMU's orientations. [default: found by type]"),
     ] = None,
     pose_noise: Annotated[
         tuple[float, float] | None,
@@ -259,6 +263,7 @@ def replay(
         fuse=fuse,
         gps_topic=gps_topic,
         compass_topic=compass_topic,
+        imu_topic=imu_topic,
         pose_noise=_in_radians(pose_noise),
         odom_noise=_in_radians(odom_noise),
         deskew=not no_deskew,

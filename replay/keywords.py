@@ -39,9 +39,10 @@ class ReplayKeywords(TypedDict, total=False):
     max_memory: float | None
     standing_still: bool
     fuse: Sequence[str] | str | None
-    """The sensors to fuse, of «odom», «gps», «compass»: a list, or separated by commas."""
+    """The sensors to fuse, of «odom», «gps», «compass», «imu»: a list, or separated by commas."""
     gps_topic: str | None
     compass_topic: str | None
+    imu_topic: str | None
     pose_noise: tuple[float, float] | None
     """Standard deviations of GPS positions (m) and compass headings (rad)."""
     odom_noise: tuple[float, float] | None
@@ -73,7 +74,7 @@ SWITCHES = frozenset({"standing_still", "match_scans", "deskew", "detect", "refi
 """Those that are true or false."""
 
 _SELECTION = ("start", "end", "duration", "n_scans", "stride")
-_FUSION = ("fuse", "gps_topic", "compass_topic", "pose_noise", "odom_noise")
+_FUSION = ("fuse", "gps_topic", "compass_topic", "imu_topic", "pose_noise", "odom_noise")
 
 
 def replay_options(**keywords: Unpack[ReplayKeywords]) -> ReplayOptions:
@@ -106,6 +107,7 @@ def _fusion_inputs(
     fuse: Sequence[str] | str | None = None,
     gps_topic: str | None = None,
     compass_topic: str | None = None,
+    imu_topic: str | None = None,
     pose_noise: tuple[float, float] | None = None,
     odom_noise: tuple[float, float] | None = None,
 ) -> FusionInputs:
@@ -116,8 +118,10 @@ def _fusion_inputs(
         raise UsageError(
             f"--fuse {','.join(names)}: {unknown[0] or 'an empty name'} is no sensor; they are {', '.join(SENSORS)}"
         )
+    if compass_topic is not None and imu_topic is not None:
+        raise UsageError("headings come from one sensor: --compass-topic or --imu-topic")
     noise = SensorNoise(*(pose_noise or (None, None)), *(odom_noise or (None, None)))
-    return FusionInputs(tuple(name for name in SENSORS if name in names), gps_topic, compass_topic, noise)
+    return FusionInputs(tuple(name for name in SENSORS if name in names), gps_topic, compass_topic, imu_topic, noise)
 
 
 def _listed(names: Sequence[str] | str) -> tuple[str, ...]:

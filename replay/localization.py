@@ -16,6 +16,7 @@ from prim.errors import LogReadError
 from prim.scan import PosedScan
 from prim.se2 import compose_poses, inverse_poses, path_length
 from replay.options import ReplayOptions
+from replay.poses.fusion_options import DEFAULTS as FUSION
 from replay.poses.fusion_options import FusionInputs, SensorNoise
 from replay.poses.laser_poses import (
     AT_ONCE,
@@ -98,6 +99,7 @@ def choose_poses(scans: ScanLog, options: ReplayOptions, timer: StageTimer) -> L
     """
     provider = PoseProvider(scans.log, options.odom_topic, options.laser_offset, options.fuse)
     found = _look_up_poses(provider, _retimed(scans, options), options)
+    provider, found = _with_odometry_noise(provider, found, options, timer)
     found = _where_scans_fit(provider, found, options, timer)
     if found.poses.source == SCANS:
         return found
@@ -118,7 +120,7 @@ def _matched(found: Localization, options: ReplayOptions, timer: StageTimer) -> 
     """
     from replay.mapping.bounds import bounds_of_bulk  # when they are needed: a replay without them starts faster
     from replay.poses.scan_matching import match_scans
-    from replay.poses.tracking.laser_track import track_poses
+    from replay.poses.tracking.laser_track import corrected_odometry, track_poses
     from replay.poses.tracking.options import DEFAULTS as TRACKING
 
     scans, poses = found.scans, found.poses
@@ -130,6 +132,8 @@ def _matched(found: Localization, options: ReplayOptions, timer: StageTimer) -> 
             return found._replace(poses=replace(tracked, matched=True))
         if poses.source == SCANS or track.overrules:
             poses = tracked
+        elif track.fits:
+            poses = corrected_odometry(poses, scans.times, track.odometry_errors)
     bounds = options.bounds or bounds_of_bulk(posed(poses), options.resolution)
     poses = match_scans(poses, scans.stamps, posed, options.resolution, options.noise_std, options.fuse.noise, bounds)
     if poses.source == SCANS and not track.fits:
@@ -141,6 +145,38 @@ def _matched(found: Localization, options: ReplayOptions, timer: StageTimer) -> 
     return found._replace(poses=poses)
 
 
+def _with_odometry_noise(
+    provider: PoseProvider, found: Localization, options: ReplayOptions, timer: StageTimer
+) -> tuple[PoseProvider, Localization]:
+    """Fuse poses anew where scans show how noisy the odometry is, with the provider that does so."""
+    fusion, noise = found.poses.fusion, options.fuse.noise
+    is_given = noise.odometry_translation_std is not None and noise.odometry_rotation_std is not None
+    if fusion is None or not fusion.nodes.has_odometry or is_given:
+        return provider, found
+    from replay.poses.tracking.odometry_noise import odometry_noise  # a replay by true poses starts faster
+
+    odometry = _odometry(provider, found, options)
+    std = odometry and odometry_noise(_windows(found.scans, odometry, options, timer)[0], FUSION)
+    if not std:
+        return provider, found
+    provider = provider.with_odometry_noise(std)
+    return provider, _look_up_poses(provider, found.scans, options)
+
+
+def _windows(
+    scans: ScanLog, poses: LaserPoses, options: ReplayOptions, timer: StageTimer
+) -> list[list[list[PosedScan]]]:
+    """Return windows of one laser's scans with their poses: of consecutive scans, and such that span all of them."""
+    from replay.poses.tracking.scan_fit import fit_windows
+
+    usable = np.flatnonzero(poses.valid & (scans.scanner == 0))
+    usable = usable[np.argsort(scans.stamps[usable], kind="stable")]
+    groups = [[usable[window] for window in windows] for windows in fit_windows(len(usable))]
+    wanted = scans.only(np.unique(np.concatenate([window for group in groups for window in group])))
+    posed = {one.position: one for one in pose_scans(wanted, poses, options, timer)}
+    return [[[posed[number] for number in window if number in posed] for window in group] for group in groups]
+
+
 def _where_scans_fit(
     provider: PoseProvider, found: Localization, options: ReplayOptions, timer: StageTimer
 ) -> Localization:
@@ -148,21 +184,20 @@ def _where_scans_fit(
     poses, scans = found.poses, found.scans
     if poses.source in (*EXACT_SOURCES, SCANS):
         return found
-    from replay.poses.tracking.scan_fit import ScanFit, fit_windows, scan_fit  # a replay by true poses starts faster
+    from replay.poses.tracking.scan_fit import ScanFit, scan_fit  # a replay by true poses starts faster
 
     def fits_by(by: LaserPoses) -> list[ScanFit]:
-        usable = np.flatnonzero(by.valid & (scans.scanner == 0))
-        usable = usable[np.argsort(scans.stamps[usable], kind="stable")]
-        groups = [[usable[window] for window in windows] for windows in fit_windows(len(usable))]
-        wanted = scans.only(np.unique(np.concatenate([window for group in groups for window in group])))
-        posed = {one.position: one for one in pose_scans(wanted, by, options, timer)}
-        return [
-            scan_fit([[posed[number] for number in window if number in posed] for window in group])
-            for group in groups
-        ]
+        return [scan_fit(windows) for windows in _windows(scans, by, options, timer)]
 
-    fits, is_auto = fits_by(poses), options.pose == PoseSourceName.AUTO and not options.odom_topic
+    is_auto = options.pose == PoseSourceName.AUTO and not options.odom_topic
     other = _odometry(provider, found, options) if is_auto and poses.source == FUSED else None
+    if other is not None and poses.fusion is not None and poses.fusion.gain_over_odometry() < FUSION.least_gain:
+        note = (
+            f"{poses.origin} together show the robot's way no better than {other.origin} alone, which is used; "
+            "to fuse give --pose fused"
+        )
+        found, poses, other = found._replace(poses=other, notes=(*found.notes, note)), other, None
+    fits = fits_by(poses)
     if other is not None:
         others = fits_by(other)
         worse = [pair for pair in zip(fits, others, strict=True) if pair[0].is_worse_than(pair[1])]

@@ -209,7 +209,9 @@ class ReplayOptions:
             raise UsageError("--standing-still excludes --match-scans and all that says how poses are fused")
         fuses = self.pose in ("auto", FUSED)
         if not fuses and replace(self.fuse, noise=SensorNoise()) != FusionInputs():
-            raise UsageError(f"--fuse, --gps-topic and --compass-topic do not go with --pose {self.pose}")
+            raise UsageError(
+                f"--fuse, --gps-topic, --compass-topic and --imu-topic do not go with --pose {self.pose}"
+            )
         if not fuses and not self.match_scans and self.fuse.noise != SensorNoise():
             raise UsageError("--pose-noise and --odom-noise go with --pose fused or with --match-scans")
         if self.odom_topic and self.pose not in ("auto", "odom", FUSED):

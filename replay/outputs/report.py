@@ -18,11 +18,11 @@ from replay.detection.stage import DetectionResult
 from replay.notes import pluralize
 from replay.outputs.found_objects import found_objects
 from replay.outputs.found_primitives import found_primitives
-from replay.poses.fusion_options import COMPASS, GPS, ODOM
+from replay.poses.fusion_options import COMPASS, GPS, IMU, ODOM
 from replay.poses.laser_poses import FusedSensor, LaserPoses
 from replay.result import ReplayResult
 
-UNITS = {ODOM: ("m", "rad"), GPS: ("m",), COMPASS: ("rad",)}
+UNITS = {ODOM: ("m", "rad"), GPS: ("m",), COMPASS: ("rad",), IMU: ("rad",)}
 """The units of each sensor's noise."""
 
 SCHEMA = "prim-replay/1"
@@ -129,11 +129,23 @@ def _pose_uncertainty(result: ReplayResult) -> dict[str, Any]:
                 "used": sensor.used,
                 "rejected": sensor.rejected,
                 **{f"std_{unit}": sensor.std.get(unit) for unit in UNITS[sensor.name]},
-                **({"bias_rad": sensor.bias} if sensor.name == COMPASS else {}),
+                **({"bias_rad": sensor.bias} if sensor.name in (COMPASS, IMU) else {}),
+                **_sensor_oddities(sensor),
             }
             for sensor in result.poses.sensors
         }
         or None,
+    }
+
+
+def _sensor_oddities(sensor: FusedSensor) -> dict[str, Any]:
+    """Return the scales of an odometry, and how the errors of another sensor wander."""
+    if sensor.name == ODOM:
+        return {"distance_scale": sensor.scales[0], "turn_scale": sensor.scales[1]}
+    unit = UNITS[sensor.name][0]
+    return {
+        f"wander_std_{unit}": sensor.wander and sensor.wander.std,
+        "wander_time_s": sensor.wander and sensor.wander.time,
     }
 
 
@@ -328,6 +340,11 @@ def _sensor_noise(sensor: FusedSensor) -> str:
     values = [f"{1000 * sensor.std['m']:.0f} mm"] if "m" in sensor.std else []
     values += [f"{np.degrees(sensor.std['rad']):.1f} deg"] if "rad" in sensor.std else []
     what = f"{sensor.name} {', '.join(values) or 'unknown'}"
+    if sensor.wander:
+        size = (
+            f"{1000 * sensor.wander.std:.0f} mm" if sensor.name == GPS else f"{np.degrees(sensor.wander.std):.1f} deg"
+        )
+        what += f" and {size} that wander"
     if sensor.name == ODOM:
         return f"{what} after 1 m" if values else what
     return f"{what} ({sensor.rejected} of {sensor.used + sensor.rejected} not used)" if sensor.rejected else what

@@ -9,12 +9,10 @@ from numpy.typing import NDArray
 
 from prim.arrays import FloatArray, Stamps
 from prim.se2 import Trajectory, integrate_steps, relative_steps, wrap_angles
-from replay.poses.fusion_options import FusionOptions
+from replay.poses.fusion_options import DEFAULTS, FusionOptions
 
 TimedValues = tuple[Stamps, FloatArray]
 """Stamps (M,) in ns, rising, and the values measured then: (M,) or (M, columns)."""
-
-DEFAULTS = FusionOptions()
 
 
 @dataclass(frozen=True)
@@ -27,8 +25,13 @@ class FusionNodes:
         variance_scales: What the variances of each step are proportional to (N,). With odometry a length in m: the
             odometry's path, plus ``rotation_distance`` a radian turned and ``idle_distance`` a second (FusionOptions;
             by default 0.03 m and 0.4 mm). Without odometry the time in s.
+        intervals: Times (N,) since the node before (s); 0 at the first one.
         fixes: Positions of the antenna (N, 2) in m; NaN where there is none.
-        headings: Compass headings (N,) in rad; NaN where there is none.
+        fix_scales: Factors (N,) of each fix's standard deviation; 1 where it is not stated.
+        stated_fix_std: The median of those that are stated (m); None where none is.
+        headings: Headings (N,) in rad; NaN where there is none.
+        has_north: Whether the headings are absolute but for a bias: those of a compass, not of an IMU, whose 0 is
+            anywhere.
         lever_arm: The antenna's position on the robot (2,) in m.
         initial_pose: The odometry's pose (3,) at the first node.
         has_odometry: Whether the steps are measured.
@@ -37,8 +40,12 @@ class FusionNodes:
     stamps: Stamps
     steps: FloatArray
     variance_scales: FloatArray
+    intervals: FloatArray
     fixes: FloatArray
+    fix_scales: FloatArray
+    stated_fix_std: float | None
     headings: FloatArray
+    has_north: bool
     lever_arm: FloatArray
     initial_pose: FloatArray
     has_odometry: bool
@@ -52,6 +59,8 @@ class FusionNodes:
         headings: TimedValues | None,
         lever_arm: tuple[float, float] = (0.0, 0.0),
         options: FusionOptions = DEFAULTS,
+        fix_stds: FloatArray | None = None,
+        has_north: bool = True,
     ) -> FusionNodes:
         """Place nodes at the stamps that poses are asked for, and at those of all fixes and headings.
 
@@ -61,9 +70,11 @@ class FusionNodes:
             stamps: When poses are asked for (N,) in ns.
             odometry: The robot's poses by odometry, interpolated to the nodes.
             fixes: Positions of the antenna (M, 2) in m.
-            headings: Compass headings (M,) in rad.
+            headings: Headings (M,) in rad.
             lever_arm: The antenna's position on the robot (m).
             options: How much of the variance scales is due to turns and to time.
+            fix_stds: The fixes' stated standard deviations (M,) in m; NaN where there is none.
+            has_north: Whether the headings are those of a compass.
 
         Returns:
             The nodes by rising stamp.
@@ -90,12 +101,18 @@ class FusionNodes:
             scales = np.diff(np.interp(nodes, odometry.stamps, lengths), prepend=0.0)
             scales[0] = 0.0
             scales += options.idle_distance * np.diff(nodes, prepend=nodes[0]) / 1e9
+        stated, factors = _relative_stds(fix_stds, options.max_fix_scale)
+        given = (fixes[0], factors) if fixes is not None and factors is not None else None
         return cls(
             nodes,
             steps,
             scales,
+            np.diff(nodes, prepend=nodes[0]) / 1e9,
             _at_nodes(nodes, fixes, 2),
+            np.nan_to_num(_at_nodes(nodes, given, 1)[:, 0], nan=1.0),
+            stated,
             _at_nodes(nodes, headings, 1)[:, 0],
+            has_north,
             np.array(lever_arm),
             initial_pose,
             odometry is not None,
@@ -127,7 +144,9 @@ class FusionNodes:
             stamps=self.stamps[piece],
             steps=self.steps[piece],
             variance_scales=self.variance_scales[piece],
+            intervals=self.intervals[piece],
             fixes=self.fixes[piece],
+            fix_scales=self.fix_scales[piece],
             headings=self.headings[piece],
         )
 
@@ -140,7 +159,9 @@ class FusionNodes:
             stamps=self.stamps[indices],
             steps=relative_steps(poses),
             variance_scales=scales,
+            intervals=np.diff(self.stamps[indices], prepend=self.stamps[indices[:1]]) / 1e9,
             fixes=self.fixes[indices],
+            fix_scales=self.fix_scales[indices],
             headings=self.headings[indices],
         )
 
@@ -152,6 +173,14 @@ def _at_nodes(nodes: Stamps, readings: TimedValues | None, columns: int) -> Floa
         within = (readings[0] >= nodes[0]) & (readings[0] <= nodes[-1])
         values[np.searchsorted(nodes, readings[0][within])] = readings[1].reshape(-1, columns)[within]
     return values
+
+
+def _relative_stds(stds: FloatArray | None, most: float) -> tuple[float | None, FloatArray | None]:
+    """Return the median of stated standard deviations (M,), and what each is of it; None where none is stated."""
+    if stds is None or not np.isfinite(stds).any():
+        return None, None
+    median = float(np.nanmedian(stds))
+    return median, np.clip(np.nan_to_num(stds / median, nan=1.0), 1 / most, most)
 
 
 def weighted_path_lengths(odometry: Trajectory, rotation_distance: float) -> FloatArray:

@@ -1,13 +1,15 @@
 """The compiled kernels of pose estimation: an extended Kalman filter and a Rauch-Tung-Striebel smoother.
 
-The state is the robot's x, y (m) and heading (rad, not wrapped) in the map frame. Time is cut into nodes; from one to
-the next the robot moves by a step that is measured in its own frame (Thrun, Burgard and Fox, Probabilistic
-Robotics, 2005, chapter 5: odometry as control), whose variances grow with distance, turns and time (see
-:class:`Measurements`). At a node there may be a position fix, a heading, and a scan's log-likelihood of the pose.
-Covariances are stored as the six numbers xx, xy, xt, yy, yt, tt of their upper triangles.
+The state is the robot's x, y (m) and heading (rad, not wrapped) in the map frame, and, where the errors of fixes or
+headings wander, what these are at the moment: x, y (m) and heading (rad). Time is cut into nodes; from one to the
+next the robot moves by a step that is measured in its own frame (Thrun, Burgard and Fox, Probabilistic Robotics,
+2005, chapter 5: odometry as control), whose variances grow with distance, turns and time (see
+:class:`Measurements`), and wandering errors decay and are renewed (first-order Gauss-Markov processes: Gelb, Applied
+Optimal Estimation, 1974, section 3.8). At a node there may be a position fix, a heading, and a scan's log-likelihood
+of the pose.
 
-filterpy's filter does the same at some 70 to 150 microseconds a node; these take below one (bench/poses.py), which
-makes it affordable to estimate the noise by filtering a log some fifty times. The tests compare them with filterpy.
+filterpy's filter does the same at some 70 to 150 microseconds a node; these take one or two (bench/poses.py), which
+makes it affordable to estimate the noise by filtering a log some hundred times. The tests compare them with filterpy.
 """
 
 from __future__ import annotations
@@ -18,28 +20,61 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from prim import linear_algebra
 from prim.arrays import FloatArray
 from prim.compiled import inline, kernel
 
 FIX_STD, HEADING_STD, TRANSLATION_STD, ROTATION_STD, HEADING_BIAS = range(5)
-"""Indices into the noise parameters (5,): standard deviations of fixes (m) and headings (rad); those of a step's
+"""Indices into the noise parameters (11,): standard deviations of fixes (m) and headings (rad); those of a step's
 translation (m, along each axis) and rotation (rad) where its variance scale is 1, that is after one metre straight on
 or, without odometry, after one second; and the constant offset of all headings (rad)."""
+
+SCALES = DISTANCE_SCALE, TURN_SCALE = tuple(range(5, 7))
+"""Factors that the odometry's distances and turns are multiplied by."""
+
+WANDER = WANDER_STD, WANDER_TIME, HEADING_WANDER_STD, HEADING_WANDER_TIME = tuple(range(7, 11))
+TIMES = WANDER_TIME, HEADING_WANDER_TIME
+"""Standard deviations (m along each axis; rad) and time constants (s) of wandering errors of fixes and headings."""
+
+PARAMETERS = 11
+"""How many noise parameters there are."""
+
+POSE, WITH_WANDER = 3, 6
+"""Sizes of the state: of the pose alone, and with the wandering errors of fixes and headings."""
 
 USED, REJECTED = 1, 2
 """The gate's decision on a measurement; 0 where there is none."""
 
 
 class FilterState(NamedTuple):
-    """A Gaussian belief about the robot's pose.
+    """A Gaussian belief about the state.
 
     Attributes:
-        pose: The mean (3,): x, y (m), heading (rad, not wrapped).
-        covariance: Its covariance, the six numbers (6,) of the upper triangle.
+        mean: (K,): x, y (m), heading (rad, not wrapped) of the robot; with K = 6 the wandering errors.
+        covariance: (K, K).
     """
 
-    pose: FloatArray
+    mean: FloatArray
     covariance: FloatArray
+
+    def with_pose(self, pose: FloatArray, covariance: FloatArray) -> FilterState:
+        """Return the belief after something was learnt of the pose alone.
+
+        Args:
+            pose: (3,) what the pose's mean becomes.
+            covariance: (3, 3) what its covariance becomes.
+
+        Returns:
+            The belief; wandering errors follow by their correlation with the pose.
+        """
+        before = self.covariance[:POSE, :POSE]
+        gain = None if len(self.mean) == POSE else linear_algebra.solve(before, self.covariance[:POSE, POSE:])
+        if gain is None:
+            return FilterState(pose, covariance)
+        mean = np.concatenate((pose, self.mean[POSE:] + gain.T @ (pose - self.mean[:POSE])))
+        rest = self.covariance[POSE:, POSE:] + gain.T @ (covariance - before) @ gain
+        shared = covariance @ gain
+        return FilterState(mean, np.block([[covariance, shared], [shared.T, rest]]))
 
 
 class QuadraticTerms(NamedTuple):
@@ -51,13 +86,18 @@ class QuadraticTerms(NamedTuple):
 
     Attributes:
         gradients: The gradients g (N, 3).
-        information: The information matrices I (N, 6).
+        information: The information matrices I (N, 3, 3).
         centers: The poses (N, 3) that the approximations are made at.
     """
 
     gradients: FloatArray
     information: FloatArray
     centers: FloatArray
+
+    @classmethod
+    def zeros(cls, nodes: int) -> QuadraticTerms:
+        """Return those of so many nodes without a scan."""
+        return cls(np.zeros((nodes, 3)), np.zeros((nodes, 3, 3)), np.zeros((nodes, 3)))
 
 
 class Measurements(NamedTuple):
@@ -68,16 +108,23 @@ class Measurements(NamedTuple):
         variance_scales: The variances (N,) of each step's process noise, in units of the squared standard deviations
             at TRANSLATION_STD and ROTATION_STD. With odometry a length in m, in which turns and time count as
             distance; without odometry the time in s (see FusionNodes).
+        intervals: Times (N,) since the node before (s).
         fixes: Positions of the antenna (N, 2) in m; NaN where there is none.
-        headings: Compass headings (N,) in rad; NaN where there is none.
+        fix_scales: Factors (N,) of each fix's standard deviation.
+        headings: Headings (N,) in rad; NaN where there is none.
         scans: The scans' log-likelihoods; of N nodes, or of none at all.
+        references: Headings (N,) at the node before (rad, not wrapped), about which steps are linear; NaN: about the
+            filter's own.
     """
 
     steps: FloatArray
     variance_scales: FloatArray
+    intervals: FloatArray
     fixes: FloatArray
+    fix_scales: FloatArray
     headings: FloatArray
     scans: QuadraticTerms
+    references: FloatArray
 
 
 class Gate(NamedTuple):
@@ -98,7 +145,7 @@ class FilterModel(NamedTuple):
     """The parameters of the filter.
 
     Attributes:
-        noise: The noise parameters (5,), indexed by FIX_STD and so on.
+        noise: The noise parameters (11,), indexed by FIX_STD and so on.
         lever_arm: The antenna's position on the robot (2,) in m.
         fix_gate: Of position fixes.
         heading_gate: Of headings.
@@ -113,34 +160,48 @@ class FilterModel(NamedTuple):
 
 
 class FilterOutput(NamedTuple):
-    """What the filter fills at N nodes.
+    """What the filter fills at N nodes, with K numbers of the state.
 
     Attributes:
-        poses: Poses (N, 3) after each node's measurements.
-        covariances: Their covariances (N, 6).
-        predicted_poses: Poses (N, 3) before them.
-        predicted_covariances: Their covariances (N, 6).
+        means: States (N, K) after each node's measurements.
+        covariances: Their covariances (N, K, K).
+        predicted_means: States (N, K) before them.
+        predicted_covariances: Their covariances (N, K, K).
         costs: Minus twice the log-likelihood (N,) of each node's fix and heading, up to a constant.
         decisions: Whether each node's fix and heading (N, 2) were USED, REJECTED or absent (0).
+        kept: How much (N, K) of each number of the state is left after a step: less than 1 of wandering errors.
+        motions: Each step (N, 2) in the map frame (m), with the heading that it is linear about.
     """
 
-    poses: FloatArray
+    means: FloatArray
     covariances: FloatArray
-    predicted_poses: FloatArray
+    predicted_means: FloatArray
     predicted_covariances: FloatArray
     costs: FloatArray
     decisions: NDArray[np.int64]
+    kept: FloatArray
+    motions: FloatArray
 
     @classmethod
-    def empty(cls, nodes: int) -> FilterOutput:
-        """Return uninitialised arrays for so many nodes."""
+    def empty(cls, nodes: int, size: int) -> FilterOutput:
+        """Return uninitialised arrays.
+
+        Args:
+            nodes: How many nodes there are.
+            size: How many numbers the state has.
+
+        Returns:
+            The arrays.
+        """
         return cls(
-            np.empty((nodes, 3)),
-            np.empty((nodes, 6)),
-            np.empty((nodes, 3)),
-            np.empty((nodes, 6)),
+            np.empty((nodes, size)),
+            np.empty((nodes, size, size)),
+            np.empty((nodes, size)),
+            np.empty((nodes, size, size)),
             np.empty(nodes),
             np.empty((nodes, 2), np.int64),
+            np.ones((nodes, size)),
+            np.empty((nodes, 2)),
         )
 
 
@@ -151,115 +212,186 @@ def _wrap(angle: float) -> float:
 
 
 @inline
-def _update(pose: Any, cov: Any, hx: float, hy: float, ht: float, variance: float, innovation: float) -> None:
-    """Update the state with one scalar measurement that is linear in it with coefficients hx, hy, ht."""
-    xx, xy, xt, yy, yt, tt = cov[0], cov[1], cov[2], cov[3], cov[4], cov[5]
-    a = xx * hx + xy * hy + xt * ht
-    b = xy * hx + yy * hy + yt * ht
-    c = xt * hx + yt * hy + tt * ht
-    spread = hx * a + hy * b + ht * c + variance
-    gain = innovation / spread
-    pose[0] += a * gain
-    pose[1] += b * gain
-    pose[2] += c * gain
-    cov[0], cov[1], cov[2] = xx - a * a / spread, xy - a * b / spread, xt - a * c / spread
-    cov[3], cov[4], cov[5] = yy - b * b / spread, yt - b * c / spread, tt - c * c / spread
+def _update(mean: Any, cov: Any, row: Any, variance: float, innovation: float, work: Any) -> None:
+    """Update the state with one scalar measurement that is linear in it with the coefficients of ``row``."""
+    size = len(mean)
+    spread = variance
+    for i in range(size):
+        work[i] = 0.0
+        for j in range(size):
+            work[i] += cov[i, j] * row[j]
+        spread += row[i] * work[i]
+    for i in range(size):
+        mean[i] += work[i] * innovation / spread
+        for j in range(size):
+            cov[i, j] -= work[i] * work[j] / spread
 
 
 @inline
-def _invert(cov: Any, out: Any) -> None:
-    """Invert a symmetric 3 x 3 matrix given by its six numbers."""
-    xx, xy, xt, yy, yt, tt = cov[0], cov[1], cov[2], cov[3], cov[4], cov[5]
-    a, b, c = yy * tt - yt * yt, xt * yt - xy * tt, xy * yt - xt * yy
-    scale = 1 / (xx * a + xy * b + xt * c)
-    out[0], out[1], out[2] = a * scale, b * scale, c * scale
-    out[3], out[4], out[5] = (xx * tt - xt * xt) * scale, (xy * xt - xx * yt) * scale, (xx * yy - xy * xy) * scale
-
-
-@inline
-def _predict(pose: Any, cov: Any, step: Any, position_variance: float, heading_variance: float) -> None:
-    """Move the state by a step in the robot's frame and add the process noise."""
-    cos, sin = math.cos(pose[2]), math.sin(pose[2])
+def _predict(
+    mean: Any, cov: Any, step: Any, reference: float, position_variance: float, heading_variance: float, motion: Any
+) -> None:
+    """Move the pose by a step in the robot's frame and add the process noise; ``motion`` gets it in the map frame."""
+    heading = mean[2] if math.isnan(reference) else reference
+    cos, sin = math.cos(heading), math.sin(heading)
     dx, dy = cos * step[0] - sin * step[1], sin * step[0] + cos * step[1]
-    pose[0] += dx
-    pose[1] += dy
-    pose[2] += step[2]
-    xx, xy, xt, yy, yt, tt = cov[0], cov[1], cov[2], cov[3], cov[4], cov[5]
-    cov[0] = xx - 2 * dy * xt + dy * dy * tt + position_variance
-    cov[1] = xy + dx * xt - dy * yt - dx * dy * tt
-    cov[2] = xt - dy * tt
-    cov[3] = yy + 2 * dx * yt + dx * dx * tt + position_variance
-    cov[4] = yt + dx * tt
-    cov[5] = tt + heading_variance
+    motion[0], motion[1] = dx, dy
+    mean[0] += dx - dy * (mean[2] - heading)
+    mean[1] += dy + dx * (mean[2] - heading)
+    mean[2] += step[2]
+    size = len(mean)
+    for j in range(size):
+        cov[0, j] -= dy * cov[2, j]
+        cov[1, j] += dx * cov[2, j]
+    for i in range(size):
+        cov[i, 0] -= dy * cov[i, 2]
+        cov[i, 1] += dx * cov[i, 2]
+    cov[0, 0] += position_variance
+    cov[1, 1] += position_variance
+    cov[2, 2] += heading_variance
 
 
 @inline
-def _update_with_scan(pose: Any, cov: Any, gradient: Any, information: Any, center: Any, work: Any) -> None:
-    """Update the state with one row of QuadraticTerms, in information form."""
-    dx, dy, dt = pose[0] - center[0], pose[1] - center[1], _wrap(pose[2] - center[2])
-    i = information
-    gx = gradient[0] - i[0] * dx - i[1] * dy - i[2] * dt
-    gy = gradient[1] - i[1] * dx - i[3] * dy - i[4] * dt
-    gt = gradient[2] - i[2] * dx - i[4] * dy - i[5] * dt
-    _invert(cov, work)
-    for k in range(6):
-        work[k] += i[k]
-    _invert(work, cov)
-    pose[0] += cov[0] * gx + cov[1] * gy + cov[2] * gt
-    pose[1] += cov[1] * gx + cov[3] * gy + cov[4] * gt
-    pose[2] += cov[2] * gx + cov[4] * gy + cov[5] * gt
+def _decay(mean: Any, cov: Any, noise: Any, seconds: float, min_variance: float, kept: Any) -> None:
+    """Let wandering errors decay towards zero for a time, and renew them; ``kept`` gets what is left of each."""
+    size = len(mean)
+    for k in range(POSE, size):
+        std, time = noise[WANDER_STD], noise[WANDER_TIME]
+        if k == POSE + 2:
+            std, time = noise[HEADING_WANDER_STD], noise[HEADING_WANDER_TIME]
+        left = math.exp(-seconds / time)
+        kept[k] = left
+        mean[k] *= left
+        for i in range(size):
+            cov[i, k] *= left
+        for i in range(size):
+            cov[k, i] *= left
+        cov[k, k] += std * std * (1 - left * left) + min_variance
+
+
+@inline
+def _update_with_scan(mean: Any, cov: Any, gradient: Any, information: Any, center: Any, work: Any) -> None:
+    """Update the state with one row of QuadraticTerms.
+
+    The covariance P becomes P - P' M P', where P' is its part of the pose, and M = I (1 + P' I)^-1.
+    """
+    size = len(mean)
+    spread, inverse, gain = work[0], work[1], work[2]  # (3, 3) each
+    columns, moved = cov[:, :POSE].copy(), np.empty((size, POSE))
+    _multiply(columns[:POSE], information, spread)
+    for i in range(POSE):
+        spread[i, i] += 1.0
+    _invert(spread, inverse)
+    _multiply(information, inverse, gain)
+    _multiply(columns, gain, moved)
+    for i in range(size):
+        for j in range(i, size):
+            for m in range(POSE):
+                cov[i, j] -= moved[i, m] * columns[j, m]
+            cov[j, i] = cov[i, j]
+    dx, dy, dt = mean[0] - center[0], mean[1] - center[1], _wrap(mean[2] - center[2])
+    gx = gradient[0] - information[0, 0] * dx - information[0, 1] * dy - information[0, 2] * dt
+    gy = gradient[1] - information[1, 0] * dx - information[1, 1] * dy - information[1, 2] * dt
+    gt = gradient[2] - information[2, 0] * dx - information[2, 1] * dy - information[2, 2] * dt
+    for i in range(size):
+        mean[i] += cov[i, 0] * gx + cov[i, 1] * gy + cov[i, 2] * gt
+
+
+@inline
+def _multiply(a: Any, b: Any, out: Any) -> None:
+    """Compute the product of two matrices."""
+    for i in range(a.shape[0]):
+        for j in range(b.shape[1]):
+            out[i, j] = 0.0
+            for m in range(b.shape[0]):
+                out[i, j] += a[i, m] * b[m, j]
+
+
+@inline
+def _invert(a: Any, out: Any) -> None:
+    """Invert a 3 x 3 matrix."""
+    for i in range(3):
+        j, k = (i + 1) % 3, (i + 2) % 3
+        for m in range(3):
+            n, p = (m + 1) % 3, (m + 2) % 3
+            out[m, i] = a[j, n] * a[k, p] - a[j, p] * a[k, n]
+    determinant = a[0, 0] * out[0, 0] + a[0, 1] * out[1, 0] + a[0, 2] * out[2, 0]
+    for i in range(3):
+        for m in range(3):
+            out[m, i] /= determinant
 
 
 @inline
 def _update_with_fix(
-    pose: Any, cov: Any, predicted: Any, fix: Any, lever: Any, variance: float, gate: Gate, rejections: int
+    mean: Any, cov: Any, predicted: Any, fix: Any, lever: Any, variance: float, gate: Gate, rejections: int, work: Any
 ) -> tuple[float, int]:
     """Update the state with a position fix of the antenna at the lever arm.
 
     Returns its cost (minus twice the log-likelihood, up to a constant; capped at the gate where it is rejected) and
     the number of rejections in a row. After ``gate.max_rejections`` of them the robot is taken to have been moved by
-    the innovation, unmeasured: that inflates ``predicted``, the predicted covariance (6,), as well, so that the
-    smoother does not spread the jump over earlier steps.
+    the innovation, unmeasured: that inflates ``predicted``, the predicted covariance, as well, so that the smoother
+    does not spread the jump over earlier steps.
     """
-    x, y = fix[0], fix[1]
-    cos, sin = math.cos(pose[2]), math.sin(pose[2])
+    size = len(mean)
+    along, across, product = work[0], work[1], work[2]
+    along[:] = 0.0
+    across[:] = 0.0
+    cos, sin = math.cos(mean[2]), math.sin(mean[2])
     lx, ly = cos * lever[0] - sin * lever[1], sin * lever[0] + cos * lever[1]
-    nx, ny = x - pose[0] - lx, y - pose[1] - ly
-    xx = cov[0] - 2 * ly * cov[2] + ly * ly * cov[5] + variance
-    xy = cov[1] + lx * cov[2] - ly * cov[4] - lx * ly * cov[5]
-    yy = cov[3] + 2 * lx * cov[4] + lx * lx * cov[5] + variance
+    along[0], along[2], across[1], across[2] = 1.0, -ly, 1.0, lx
+    nx, ny = fix[0] - mean[0] - lx, fix[1] - mean[1] - ly
+    if size > POSE:
+        along[POSE], across[POSE + 1] = 1.0, 1.0
+        nx -= mean[POSE]
+        ny -= mean[POSE + 1]
+    xx, xy, yy = variance, 0.0, variance
+    for i in range(size):
+        for j in range(size):
+            xx += along[i] * cov[i, j] * along[j]
+            xy += along[i] * cov[i, j] * across[j]
+            yy += across[i] * cov[i, j] * across[j]
     determinant = xx * yy - xy * xy
     squared = (yy * nx * nx - 2 * xy * nx * ny + xx * ny * ny) / determinant
-    size = math.log(determinant)
+    cost = math.log(determinant)
     if squared > gate.threshold:
         if rejections < gate.max_rejections:
-            return gate.threshold + size, rejections + 1
-        cov[0] += nx * nx
-        cov[3] += ny * ny
-        predicted[0] += nx * nx
-        predicted[3] += ny * ny
-    _update(pose, cov, 1.0, 0.0, -ly, variance, nx)
-    ny = y - pose[1] - (math.sin(pose[2]) * lever[0] + math.cos(pose[2]) * lever[1])
-    _update(pose, cov, 0.0, 1.0, lx, variance, ny)
-    return min(squared, gate.threshold) + size, 0
+            return gate.threshold + cost, rejections + 1
+        cov[0, 0] += nx * nx
+        cov[1, 1] += ny * ny
+        predicted[0, 0] += nx * nx
+        predicted[1, 1] += ny * ny
+    _update(mean, cov, along, variance, nx, product)
+    ny = fix[1] - mean[1] - (math.sin(mean[2]) * lever[0] + math.cos(mean[2]) * lever[1])
+    if size > POSE:
+        ny -= mean[POSE + 1]
+    _update(mean, cov, across, variance, ny, product)
+    return min(squared, gate.threshold) + cost, 0
 
 
 @inline
 def _update_with_heading(
-    pose: Any, cov: Any, predicted: Any, heading: float, variance: float, gate: Gate, rejections: int
+    mean: Any, cov: Any, predicted: Any, heading: float, variance: float, gate: Gate, rejections: int, work: Any
 ) -> tuple[float, int]:
     """Update the state with a heading; arguments and result are those of _update_with_fix."""
-    innovation = _wrap(heading - pose[2])
-    spread = cov[5] + variance
+    row, product = work[0], work[1]
+    row[:] = 0.0
+    row[2] = 1.0
+    innovation, spread = heading - mean[2], cov[2, 2] + variance
+    if len(mean) > POSE:
+        last = POSE + 2
+        row[last] = 1.0
+        innovation -= mean[last]
+        spread += 2 * cov[2, last] + cov[last, last]
+    innovation = _wrap(innovation)
     squared = innovation * innovation / spread
-    size = math.log(spread)
+    cost = math.log(spread)
     if squared > gate.threshold:
         if rejections < gate.max_rejections:
-            return gate.threshold + size, rejections + 1
-        cov[5] += innovation * innovation
-        predicted[5] += innovation * innovation
-    _update(pose, cov, 0.0, 0.0, 1.0, variance, innovation)
-    return min(squared, gate.threshold) + size, 0
+            return gate.threshold + cost, rejections + 1
+        cov[2, 2] += innovation * innovation
+        predicted[2, 2] += innovation * innovation
+    _update(mean, cov, row, variance, innovation, product)
+    return min(squared, gate.threshold) + cost, 0
 
 
 @kernel
@@ -270,7 +402,7 @@ def run_filter(initial: FilterState, measurements: Measurements, model: FilterMo
         initial: The belief before the first step; copied, and left unchanged.
         measurements: What is measured at the nodes.
         model: The parameters of the filter.
-        output: Filled; arrays of N rows.
+        output: Filled; arrays of N rows, with states of the initial one's size.
     """
     # unpacked once: each access to a tuple's array costs an atomic reference count
     steps, variance_scales, noise, lever = (
@@ -279,42 +411,54 @@ def run_filter(initial: FilterState, measurements: Measurements, model: FilterMo
         model.noise,
         model.lever_arm,
     )
-    fixes, headings = measurements.fixes, measurements.headings
+    intervals, fixes, fix_scales, headings, references = (
+        measurements.intervals,
+        measurements.fixes,
+        measurements.fix_scales,
+        measurements.headings,
+        measurements.references,
+    )
     gradients, information, centers = (
         measurements.scans.gradients,
         measurements.scans.information,
         measurements.scans.centers,
     )
-    poses, covariances, costs, decisions = output.poses, output.covariances, output.costs, output.decisions
-    predicted_poses, predicted_covariances = output.predicted_poses, output.predicted_covariances
-    pose, cov, work = initial.pose.copy(), initial.covariance.copy(), np.empty(6)
+    means, covariances, costs, decisions = output.means, output.covariances, output.costs, output.decisions
+    predicted_means, predicted_covariances = output.predicted_means, output.predicted_covariances
+    kept, motions = output.kept, output.motions
+    mean, cov = initial.mean.copy(), initial.covariance.copy()
+    work, squares, step = np.empty((3, len(mean))), np.empty((3, 3, 3)), np.empty(3)
     fix_variance, heading_variance = noise[FIX_STD] ** 2, noise[HEADING_STD] ** 2
     fix_gate, heading_gate, min_variance = model.fix_gate, model.heading_gate, model.min_step_variance
     fix_rejections = heading_rejections = 0
     for k in range(len(steps)):
         translation_variance = variance_scales[k] * noise[TRANSLATION_STD] ** 2 + min_variance
         rotation_variance = variance_scales[k] * noise[ROTATION_STD] ** 2 + min_variance
-        _predict(pose, cov, steps[k], translation_variance, rotation_variance)
-        predicted_poses[k], predicted_covariances[k] = pose, cov
+        step[0], step[1] = steps[k, 0] * noise[DISTANCE_SCALE], steps[k, 1] * noise[DISTANCE_SCALE]
+        step[2] = steps[k, 2] * noise[TURN_SCALE]
+        _predict(mean, cov, step, references[k], translation_variance, rotation_variance, motions[k])
+        _decay(mean, cov, noise, intervals[k], min_variance, kept[k])
+        predicted_means[k], predicted_covariances[k] = mean, cov
         predicted = predicted_covariances[k]
         costs[k] = 0.0
         decisions[k] = 0
         if not math.isnan(fixes[k, 0]):
+            variance = fix_variance * fix_scales[k] ** 2
             cost, fix_rejections = _update_with_fix(
-                pose, cov, predicted, fixes[k], lever, fix_variance, fix_gate, fix_rejections
+                mean, cov, predicted, fixes[k], lever, variance, fix_gate, fix_rejections, work
             )
             costs[k] += cost
             decisions[k, 0] = REJECTED if fix_rejections else USED
         if not math.isnan(headings[k]):
             heading = headings[k] - noise[HEADING_BIAS]
             cost, heading_rejections = _update_with_heading(
-                pose, cov, predicted, heading, heading_variance, heading_gate, heading_rejections
+                mean, cov, predicted, heading, heading_variance, heading_gate, heading_rejections, work
             )
             costs[k] += cost
             decisions[k, 1] = REJECTED if heading_rejections else USED
         if len(gradients):
-            _update_with_scan(pose, cov, gradients[k], information[k], centers[k], work)
-        poses[k], covariances[k] = pose, cov
+            _update_with_scan(mean, cov, gradients[k], information[k], centers[k], squares)
+        means[k], covariances[k] = mean, cov
 
 
 @kernel
@@ -324,44 +468,73 @@ def smooth(filtered: FilterOutput, gains: Any) -> None:
     Each node's estimate then rests on all measurements, the later ones too.
 
     Args:
-        filtered: What :func:`run_filter` filled; poses and covariances become the smoothed ones.
-        gains: Filled (N, 3, 3): the smoother's gains, by which a node's error depends on the next one's.
+        filtered: What :func:`run_filter` filled; means and covariances become the smoothed ones.
+        gains: Filled (N, K, K): the smoother's gains, by which a node's error depends on the next one's.
     """
-    poses, covs = filtered.poses, filtered.covariances
-    predicted, predicted_covs = filtered.predicted_poses, filtered.predicted_covariances
-    info = np.empty(6)
-    f, p, gain = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
-    change, product = np.empty((3, 3)), np.empty((3, 3))
-    for k in range(len(poses) - 2, -1, -1):
-        dx, dy = predicted[k + 1, 0] - poses[k, 0], predicted[k + 1, 1] - poses[k, 1]
-        _invert(predicted_covs[k + 1], info)
-        _unpack(covs[k], f)
-        for i in range(3):  # covariance times the transposed Jacobian of the motion
-            p[i, 0], p[i, 1], p[i, 2] = f[i, 0] - dy * f[i, 2], f[i, 1] + dx * f[i, 2], f[i, 2]
-        _unpack(info, f)
-        _multiply(p, f, gain)
+    means, covs = filtered.means, filtered.covariances
+    predicted, predicted_covs = filtered.predicted_means, filtered.predicted_covariances
+    kept, motions = filtered.kept, filtered.motions
+    size = means.shape[1]
+    factor, shared = np.empty((size, size)), np.empty((size, size))
+    gain, product = np.empty((size, size)), np.empty((size, size))
+    for k in range(len(means) - 2, -1, -1):
+        _correlate_with_next(covs[k], motions[k + 1], kept[k + 1], shared)
+        _factorize(predicted_covs[k + 1], factor)
+        for i in range(size):
+            _solve_factorized(factor, shared[i], gain[i])
         gains[k] = gain
-        for i in range(3):
-            correction = 0.0
-            for j in range(3):
-                correction += gain[i, j] * (poses[k + 1, j] - predicted[k + 1, j])
-            poses[k, i] += correction
-        for i in range(6):
-            info[i] = covs[k + 1, i] - predicted_covs[k + 1, i]
-        _unpack(info, change)
-        _multiply(gain, change, product)
-        n = 0
-        for i in range(3):
-            for j in range(i, 3):
-                added = 0.0
-                for m in range(3):
-                    added += product[i, m] * gain[j, m]
-                covs[k, n] += added
-                n += 1
+        for i in range(size):
+            for j in range(size):
+                means[k, i] += gain[i, j] * (means[k + 1, j] - predicted[k + 1, j])
+                product[i, j] = 0.0
+                for m in range(size):
+                    product[i, j] += gain[i, m] * (covs[k + 1, m, j] - predicted_covs[k + 1, m, j])
+        for i in range(size):
+            for j in range(i, size):
+                for m in range(size):
+                    covs[k, i, j] += product[i, m] * gain[j, m]
+                covs[k, j, i] = covs[k, i, j]
+
+
+@inline
+def _correlate_with_next(cov: Any, motion: Any, kept: Any, out: Any) -> None:
+    """Compute the covariance of a state with the next one as it is predicted."""
+    for i in range(len(cov)):
+        out[i, 0] = cov[i, 0] - motion[1] * cov[i, 2]
+        out[i, 1] = cov[i, 1] + motion[0] * cov[i, 2]
+        out[i, 2] = cov[i, 2]
+        for j in range(POSE, len(cov)):
+            out[i, j] = cov[i, j] * kept[j]
+
+
+@inline
+def _factorize(matrix: Any, factor: Any) -> None:
+    """Fill the lower Cholesky factor of a covariance; what rounding makes negative counts as next to nothing."""
+    for i in range(len(matrix)):
+        for j in range(i + 1):
+            rest = matrix[i, j]
+            for m in range(j):
+                rest -= factor[i, m] * factor[j, m]
+            factor[i, j] = math.sqrt(max(rest, 1e-15 * matrix[i, i])) if i == j else rest / factor[j, j]
+
+
+@inline
+def _solve_factorized(factor: Any, right: Any, out: Any) -> None:
+    """Solve a linear equation by the lower Cholesky factor of its matrix."""
+    size = len(right)
+    for i in range(size):
+        out[i] = right[i]
+        for m in range(i):
+            out[i] -= factor[i, m] * out[m]
+        out[i] /= factor[i, i]
+    for i in range(size - 1, -1, -1):
+        for m in range(i + 1, size):
+            out[i] -= factor[m, i] * out[m]
+        out[i] /= factor[i, i]
 
 
 @kernel
-def mean_frame_covariance(poses: Any, covariances: Any, gains: Any, selected: Any) -> Any:
+def mean_frame_covariance(means: Any, covariances: Any, gains: Any, selected: Any) -> Any:
     """Compute the covariance of the map frame that the mean error of selected smoothed poses causes.
 
     An error of a pose moves what is seen from it: by the pose's own error at its place, turned about it. The motion
@@ -369,61 +542,30 @@ def mean_frame_covariance(poses: Any, covariances: Any, gains: Any, selected: An
     that of node k > j is the product of the gains between them.
 
     Args:
-        poses: Smoothed poses (N, 3).
-        covariances: Their covariances (N, 6).
-        gains: The smoother's gains (N, 3, 3).
+        means: Smoothed states (N, K), which begin with the pose.
+        covariances: Their covariances (N, K, K).
+        gains: The smoother's gains (N, K, K).
         selected: Which nodes to average over (N,), bool.
 
     Returns:
         The covariance (3, 3) of the frame's x, y (m) and heading (rad) at its origin.
     """
-    cov, lever, carried = np.empty((3, 3)), np.eye(3), np.zeros((3, 3))
-    later, total = np.zeros((3, 3)), np.zeros((3, 3))
+    size = means.shape[1]
+    lever, carried = np.eye(3), np.zeros((size, 3))
+    later, own, total = np.zeros((size, 3)), np.zeros((size, 3)), np.zeros((3, 3))
     count = 0
-    for k in range(len(poses) - 1, -1, -1):
-        if k < len(poses) - 1:
+    for k in range(len(means) - 1, -1, -1):
+        if k < len(means) - 1:
             # covariance of this error with the sum of the later ones, moved to the origin
             _multiply(gains[k], carried, later)
-        _unpack(covariances[k], cov)
-        lever[2, 0], lever[2, 1] = poses[k, 1], -poses[k, 0]  # transposed
+        lever[2, 0], lever[2, 1] = means[k, 1], -means[k, 0]  # transposed
+        carried[:] = later
         if selected[k]:
             count += 1
-            _multiply(cov, lever, carried)
+            _multiply(covariances[k, :, :POSE].copy(), lever, own)
+            carried += own
             for i in range(3):
                 for j in range(3):
                     for m in range(3):
-                        total[i, j] += lever[m, i] * (carried[m, j] + later[m, j]) + later[m, i] * lever[m, j]
-            for i in range(3):
-                for j in range(3):
-                    carried[i, j] += later[i, j]
-        else:
-            for i in range(3):
-                for j in range(3):
-                    carried[i, j] = later[i, j]
+                        total[i, j] += lever[m, i] * carried[m, j] + later[m, i] * lever[m, j]
     return total / max(count, 1) ** 2
-
-
-@inline
-def _unpack(six: Any, out: Any) -> None:
-    """Fill a symmetric 3 x 3 matrix from its six numbers."""
-    out[0, 0], out[0, 1], out[0, 2] = six[0], six[1], six[2]
-    out[1, 0], out[1, 1], out[1, 2] = six[1], six[3], six[4]
-    out[2, 0], out[2, 1], out[2, 2] = six[2], six[4], six[5]
-
-
-@inline
-def _multiply(a: Any, b: Any, out: Any) -> None:
-    """Compute the product of two 3 x 3 matrices."""
-    for i in range(3):
-        for j in range(3):
-            out[i, j] = a[i, 0] * b[0, j] + a[i, 1] * b[1, j] + a[i, 2] * b[2, j]
-
-
-def pack_symmetric(matrices: FloatArray) -> FloatArray:
-    """Return the six numbers (..., 6) of symmetric matrices (..., 3, 3)."""
-    return matrices[..., [0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2]].copy()
-
-
-def unpack_symmetric(six: FloatArray) -> FloatArray:
-    """Return the symmetric matrices (..., 3, 3) of six numbers each (..., 6)."""
-    return six[..., [0, 1, 2, 1, 3, 4, 2, 4, 5]].reshape(*six.shape[:-1], 3, 3)

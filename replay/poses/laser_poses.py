@@ -14,6 +14,7 @@ from prim.arrays import FloatArray, Stamps
 from prim.choices import PoseSourceName, SweepName
 from prim.scan import PosedScan
 from prim.se2 import Pose2D, frame_motions
+from replay.poses.fusion_options import Wander
 
 if TYPE_CHECKING:
     from replay.poses.fusion import Fusion
@@ -116,7 +117,9 @@ class FusedSensor:
         rejected: How many were rejected as outliers.
         std: Its standard deviations, as far as they are given or estimated, by unit: ``m`` and ``rad``. Those of the
             odometry are after one metre.
-        bias: The constant offset of a compass's headings (rad).
+        bias: The constant offset of headings (rad).
+        wander: How its errors wander; None where they do not.
+        scales: What the odometry's distances and turns were multiplied by.
     """
 
     name: str
@@ -125,6 +128,8 @@ class FusedSensor:
     rejected: int
     std: Mapping[str, float]
     bias: float = 0.0
+    wander: Wander | None = None
+    scales: tuple[float, float] = (1.0, 1.0)
 
 
 class LoopCounts(NamedTuple):

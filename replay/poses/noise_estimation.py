@@ -17,11 +17,11 @@ from prim import linear_algebra
 from prim.arrays import FloatArray
 from prim.se2 import wrap_angle
 from replay.poses.fusion_options import NoiseEstimationOptions
-from replay.poses.kalman import HEADING_BIAS
+from replay.poses.kalman import HEADING_BIAS, SCALES, TIMES
 
 
 class NoiseEstimator:
-    """Maximises the likelihood of noise parameters (5,), which kalman.FIX_STD and so on index.
+    """Maximises the likelihood of noise parameters (11,), which kalman.FIX_STD and so on index.
 
     Args:
         costs: Returns minus twice each node's log-likelihood (N,), given the parameters.
@@ -36,21 +36,21 @@ class NoiseEstimator:
         """Maximise the posterior by scoring steps, which are halved where they overshoot.
 
         Args:
-            initial: Where the search starts (5,), and where the prior has its mode.
+            initial: Where the search starts (11,), and where the prior has its mode.
             free: The indices of the parameters to be estimated.
 
         Returns:
-            The parameters (5,).
+            The parameters (11,).
         """
         options = self._options
         noise = initial.copy()
-        cost = self._penalized_cost(noise, initial, free)
+        cost = self.cost(noise, initial, free)
         for _ in range(options.max_iterations):
             step = self._scoring_step(noise, initial, free)
             share = 1.0
             while share > options.min_step_share:
                 candidate = self._changed(noise, free, share * step)
-                candidate_cost = self._penalized_cost(candidate, initial, free)
+                candidate_cost = self.cost(candidate, initial, free)
                 if candidate_cost <= cost:
                     break
                 share /= 2
@@ -61,6 +61,20 @@ class NoiseEstimator:
                 break
         return noise
 
+    def cost(self, noise: FloatArray, initial: FloatArray, free: Sequence[int]) -> float:
+        """Compute minus twice the log-posterior, up to a constant.
+
+        Args:
+            noise: The parameters (11,).
+            initial: Where their prior has its mode.
+            free: The indices of those that have one.
+
+        Returns:
+            The cost.
+        """
+        squares = (_log_ratios(noise, initial, free) / self._prior_stds(free)) ** 2
+        return float(self._costs(noise).sum() + squares.sum())
+
     def is_significant(self, noise: FloatArray, parameter: int) -> bool:
         """Test by its score whether a parameter differs from its value in ``noise`` (after Rao, 1948).
 
@@ -68,7 +82,7 @@ class NoiseEstimator:
         statistic where they are correlated.
 
         Args:
-            noise: The parameters (5,), the free ones at the maximum of their posterior.
+            noise: The parameters (11,), the free ones at the maximum of their posterior.
             parameter: The index of the one to be tested.
 
         Returns:
@@ -81,8 +95,8 @@ class NoiseEstimator:
         """Return a scoring step on the log-posterior (len(free),), limited in size."""
         options = self._options
         scores = self._node_scores(noise, free)
-        prior_score = -_log_ratios(noise, initial, free) / options.prior_log_std**2
-        prior_information = [0.0 if index == HEADING_BIAS else options.prior_log_std**-2 for index in free]
+        ratios, prior_information = _log_ratios(noise, initial, free), self._prior_stds(free) ** -2.0
+        prior_score = -ratios * prior_information
         information = scores.T @ scores + np.diag(prior_information) + options.ridge * np.eye(len(free))
         step = linear_algebra.solve(information, scores.sum(axis=0) + prior_score)
         if step is None:  # the readings say nothing: the search ends here
@@ -90,16 +104,29 @@ class NoiseEstimator:
         limited: FloatArray = np.clip(step, -options.max_step, options.max_step)
         return limited
 
-    def _penalized_cost(self, noise: FloatArray, initial: FloatArray, free: Sequence[int]) -> float:
-        """Return minus twice the log-posterior, up to a constant."""
-        prior = (_log_ratios(noise, initial, free) ** 2).sum() / self._options.prior_log_std**2
-        return float(self._costs(noise).sum() + prior)
+    def _prior_stds(self, free: Sequence[int]) -> FloatArray:
+        """Return the standard deviations (len(free),) of the priors (nepers)."""
+        return np.array([self._prior_std(index) for index in free])
+
+    def _prior_std(self, index: int) -> float:
+        """Return the standard deviation of a parameter's prior (nepers); infinite for the bias, which has none."""
+        if index == HEADING_BIAS:
+            return math.inf
+        if index in TIMES:
+            return self._options.prior_time_std
+        return self._options.prior_scale_std if index in SCALES else self._options.prior_log_std
+
+    def _difference(self, index: int) -> float:
+        """Return half the interval of central differences."""
+        if index == HEADING_BIAS:
+            return self._options.bias_difference
+        return self._options.scale_difference if index in SCALES else self._options.log_difference
 
     def _node_scores(self, noise: FloatArray, free: Sequence[int]) -> FloatArray:
         """Return the gradients (N, len(free)) of each node's log-likelihood, by central differences."""
         columns = []
         for index in free:
-            size = self._options.bias_difference if index == HEADING_BIAS else self._options.log_difference
+            size = self._difference(index)
             above, below = (self._costs(self._changed(noise, [index], np.array([s]))) for s in (size, -size))
             columns.append((below - above) / (4 * size))
         return np.column_stack(columns)
@@ -112,7 +139,8 @@ class NoiseEstimator:
                 changed[index] = wrap_angle(changed[index] + delta)
             else:
                 std = changed[index] * math.exp(delta)
-                changed[index] = min(max(std, self._options.min_std), self._options.max_std)
+                most = self._options.max_time if index in TIMES else self._options.max_std
+                changed[index] = min(max(std, self._options.min_std), most)
         return changed
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shlex
 from collections.abc import Iterator, Sequence
+from copy import copy
 from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
@@ -17,18 +18,31 @@ from prim.log.source import LogSource, Topic
 from prim.se2 import Pose2D, compose_covariances, compose_poses
 from prim.text import listed
 from replay.poses.fusion import Fusion, PoseEstimate
-from replay.poses.fusion_nodes import FusionNodes
-from replay.poses.fusion_options import COMPASS, GPS, ODOM, FusionInputs, FusionOptions, SensorNoise
+from replay.poses.fusion_nodes import FusionNodes, TimedValues
+from replay.poses.fusion_options import (
+    COMPASS,
+    GPS,
+    IMU,
+    ODOM,
+    SENSORS,
+    FusionInputs,
+    FusionOptions,
+    SensorNoise,
+)
 from replay.poses.laser_poses import FUSED, STILL, FusedSensor, LaserPoses, ScanTimes
 from replay.poses.mount import SensorMounts, assumed_note
+from replay.poses.odometry_errors import OdometryErrors
 from replay.poses.sensors import (
     SCANS_HINT,
     SensorLogs,
+    SensorTopics,
     compass_headings,
     find_compass,
     find_gps,
+    find_imu,
     find_odometry,
     find_pose_topic,
+    imu_headings,
     read_odometry,
     read_sensors,
 )
@@ -131,6 +145,19 @@ class PoseProvider:
                 "two clocks in one log? by when messages were logged: --clock log",
             )
         return poses
+
+    def with_odometry_noise(self, std: tuple[float, float]) -> PoseProvider:
+        """Return a provider that fuses with another expectation of the odometry's noise.
+
+        Args:
+            std: Standard deviations (m, rad) after one metre.
+
+        Returns:
+            The provider.
+        """
+        other = copy(self)
+        other._options = replace(self._options, fusion=replace(self._options.fusion, default_odometry_std=std))
+        return other
 
     def stationary_poses(self, scans: ScanTimes) -> LaserPoses:
         """Return the poses of a robot that stands at the map's origin at all times.
@@ -285,23 +312,35 @@ class PoseProvider:
     def _can_fuse(self) -> bool:
         """Return whether the log has a GPS or compass to fuse with, as far as ``auto`` is concerned."""
         try:
-            odometry, gps, compass = self._sensor_topics()
+            topics = self._sensor_topics()
         except LogReadError:
             return False
-        return bool((odometry and (gps or compass)) or (gps and compass))
+        return bool((topics.odometry and (topics.gps or topics.compass)) or (topics.gps and topics.compass))
 
-    def _sensor_topics(self) -> tuple[Topic | None, Topic | None, Topic | None]:
-        """Return the topics of odometry, GPS and compass; None for those that are missing or not asked for."""
-        inputs = self._inputs
-        return (
-            find_odometry(self._log, self._odom_topic) if ODOM in inputs.sensors else None,
-            find_gps(self._log, inputs.gps_topic) if GPS in inputs.sensors else None,
-            find_compass(self._log, inputs.compass_topic) if COMPASS in inputs.sensors else None,
+    def _sensor_topics(self) -> SensorTopics:
+        """Return the topics of the sensors that are there and asked for: headings are a compass's, else an IMU's."""
+        inputs, log = self._inputs, self._log
+        has_compass = COMPASS in inputs.sensors and inputs.imu_topic is None
+        compass = find_compass(log, inputs.compass_topic) if has_compass else None
+        return SensorTopics(
+            find_odometry(log, self._odom_topic) if ODOM in inputs.sensors else None,
+            find_gps(log, inputs.gps_topic) if GPS in inputs.sensors else None,
+            compass,
+            self._imu_topic() if IMU in inputs.sensors and compass is None else None,
         )
 
+    def _imu_topic(self) -> Topic | None:
+        """Return the topic of an IMU; None where there are several, and none was asked for."""
+        try:
+            return find_imu(self._log, self._inputs.imu_topic)
+        except LogReadError:
+            if self._inputs.imu_topic is not None or self._inputs.sensors != SENSORS:
+                raise
+            return None
+
     def _from_fusion(self, scans: ScanTimes) -> LaserPoses:
-        """Return the robot's poses by odometry, GPS and compass, smoothed and composed with the laser's mount."""
-        sensors = read_sensors(self._log, *self._sensor_topics())
+        """Return the robot's poses by all sensors, smoothed and composed with the laser's mount."""
+        sensors = read_sensors(self._log, self._sensor_topics())
         if sensors.odometry is None and (sensors.gps is None or sensors.compass is None):
             raise LogReadError(
                 self._log.path,
@@ -336,23 +375,37 @@ class PoseProvider:
 
     def _nodes(self, scans: ScanTimes, base: str, sensors: SensorLogs) -> FusionNodes:
         """Return the measurements of the base's motion, at the query stamps and at those of the readings."""
-        gps, compass = sensors.gps, sensors.compass
+        gps = sensors.gps
         lever_arm = self._mounts.sensor_mount(gps.frame_id, base)[1] if gps else np.zeros(3)
-        rotation = self._mounts.sensor_mount(compass.frame_id, base)[0] if compass else np.eye(3)
         try:
             return FusionNodes.from_readings(
                 scans.query_stamps,
                 sensors.odometry.trajectory if sensors.odometry else None,
                 (gps.stamps, gps.values[:, :2]) if gps else None,
-                (compass.stamps, compass_headings(compass, rotation)) if compass else None,
+                self._headings(scans, base, sensors),
                 (float(lever_arm[0]), float(lever_arm[1])),
                 self._options.fusion,
+                gps.stds if gps else None,
+                sensors.imu is None,
             )
         except ValueError:
             what = f"no scan lies within the time of {sensors.topics}"
             raise LogReadError(
                 self._log.path, what, "two clocks in one log? by when messages were logged: --clock log"
             ) from None
+
+    def _headings(self, scans: ScanTimes, base: str, sensors: SensorLogs) -> TimedValues | None:
+        """Return the base's headings by the compass, or by the IMU: at the scans, which are fewer."""
+        compass, imu = sensors.compass, sensors.imu
+        if compass:
+            rotation = self._mounts.sensor_mount(compass.frame_id, base)[0]
+            return compass.stamps, compass_headings(compass, rotation)
+        if imu is None:
+            return None
+        stamps = np.unique(scans.stamps)
+        stamps = stamps[(stamps >= imu.stamps[0]) & (stamps <= imu.stamps[-1])]
+        headings = imu_headings(imu, self._mounts.sensor_mount(imu.frame_id, base)[0])
+        return (stamps, np.interp(stamps, imu.stamps, headings)) if len(stamps) else None
 
     def _gap_note(self, what: str, poses: Stamps, scans: Stamps) -> tuple[str, ...]:
         """Return a note where scans (stamps in ns) lie between poses that are far apart in time."""
@@ -371,7 +424,7 @@ class PoseProvider:
         """Return what a user should know of the sensors that were fused."""
         notes: tuple[str, ...] = ()
         if len(sensors) == 1:
-            notes += (f"no GPS and no compass: fused poses are those of {sensors[0].topic}",)
+            notes += (f"no GPS, no compass and no IMU: fused poses are those of {sensors[0].topic}",)
         for sensor in sensors:
             total = sensor.used + sensor.rejected
             if sensor.name != ODOM and not sensor.used:
@@ -379,11 +432,16 @@ class PoseProvider:
             elif sensor.rejected > self._options.max_rejected_share * total:
                 share = f"{sensor.rejected} of {total}"
                 notes += (f"{sensor.topic}: {share} readings are too far off the other sensors' and were not used",)
-            if sensor.bias:
+            if sensor.bias and sensor.name == COMPASS:
                 degrees = np.degrees(sensor.bias)
                 notes += (
                     f"{sensor.topic}: headings are off by {degrees:.1f} degrees all the time, which is taken out",
                 )
+            if sensor.wander:
+                size = f"{sensor.wander.std:.2f} m" if sensor.name == GPS else f"{np.degrees(sensor.wander.std):.1f}°"
+                slow = f"errors wander by {size} over {sensor.wander.time:.0f} s"
+                notes += (f"{sensor.topic}: {slow}, beside those that change from reading to reading: both count",)
+            notes += OdometryErrors(*sensor.scales).notes(sensor.topic)
         return notes
 
 
@@ -412,13 +470,20 @@ def _fused_sensors(sensors: SensorLogs, estimate: PoseEstimate) -> Iterator[Fuse
     noise = estimate.noise
     if sensors.odometry is not None:
         std = _known(m=noise.odometry_translation_std, rad=noise.odometry_rotation_std)
-        yield FusedSensor(ODOM, sensors.odometry.topic, len(sensors.odometry.trajectory), 0, std)
+        count, scales = len(sensors.odometry.trajectory), (noise.distance_scale or 1.0, noise.turn_scale or 1.0)
+        yield FusedSensor(ODOM, sensors.odometry.topic, count, 0, std, scales=scales)
     if sensors.gps is not None:
-        yield FusedSensor(GPS, sensors.gps.topic, *estimate.reading_counts(0), _known(m=noise.position_std))
-    if sensors.compass is not None:
-        std = _known(rad=noise.heading_std)
-        counts = estimate.reading_counts(1)
-        yield FusedSensor(COMPASS, sensors.compass.topic, *counts, std, noise.heading_bias or 0.0)
+        counts, std = estimate.reading_counts(0), _known(m=noise.position_std)
+        yield FusedSensor(GPS, sensors.gps.topic, *counts, std, wander=noise.position_wander)
+    north = sensors.compass or sensors.imu
+    if north is not None:
+        counts, std, name = (
+            estimate.reading_counts(1),
+            _known(rad=noise.heading_std),
+            COMPASS if sensors.compass else IMU,
+        )
+        bias = noise.heading_bias or 0.0
+        yield FusedSensor(name, north.topic, *counts, std, bias, noise.heading_wander)
 
 
 def _known(**std: float | None) -> dict[str, float]:

@@ -39,7 +39,7 @@ from prim.world import Bounds
 from replay.poses.fusion import Fusion
 from replay.poses.fusion_nodes import FusionNodes
 from replay.poses.fusion_options import SensorNoise
-from replay.poses.kalman import FilterState, QuadraticTerms, pack_symmetric, unpack_symmetric
+from replay.poses.kalman import POSE, FilterState, QuadraticTerms
 from replay.poses.laser_poses import LaserPoses, PosedScanSource
 
 
@@ -162,7 +162,7 @@ class ScanMatcher:
         nodes = self._fusion.nodes.stamps
         self._node_of_scan = np.searchsorted(nodes, np.clip(stamps, nodes[0], nodes[-1]))
         estimate = self._fusion.smoothed()
-        self._node_poses, self._covariances = estimate.poses, pack_symmetric(estimate.covariances)
+        self._node_poses, self._covariances = estimate.poses, estimate.covariances
         self._frame_covariance = poses.frame_covariance
         if self._frame_covariance is None and has_fixes:
             self._frame_covariance = estimate.frame_covariance(stamps)
@@ -180,7 +180,7 @@ class ScanMatcher:
             for posed in self._source(self._poses):
                 self._add(posed)
             # m^2: the variance of the heading at a lever arm of 1 m
-            variance = float(self._covariances[:, [0, 3, 5]].sum(axis=1).mean())
+            variance = float(np.trace(self._covariances, axis1=1, axis2=2).mean())
             self._match_in_rounds(rounds, self._options.annealing_deviations * math.sqrt(variance))
         return self._corrected()
 
@@ -198,14 +198,14 @@ class ScanMatcher:
             streaming = mapper.streaming_map()
             if streaming is not None:
                 state = self._match_one(ScanLikelihood.of(*streaming), rays, mount, state)
-            self._node_poses[node] = state.pose
+            self._node_poses[node] = state.mean[:POSE]
             for scan, pose in reposed(posed, self._laser_pose(posed.position)):
                 mapper.update(scan, pose)
             if len(self._scans) == due:
                 self._match_in_rounds(1, count=last + 1)
                 mapper = self._mapper_of_scans()
                 mapper.refit_streaming_map()
-                state = FilterState(self._node_poses[last].copy(), self._covariances[last].copy())
+                state = self._fusion.belief(self._node_poses[last], self._covariances[last])
                 due *= 2
 
     def _add(self, posed: PosedScan) -> ScanRays:
@@ -251,7 +251,7 @@ class ScanMatcher:
             self._frame_covariance = frame_motions(estimate.covariances[:1], estimate.poses[:1])[0]
             estimate = estimate.seen_from_first(self._fusion.initial_state)
         self._node_poses[:count] = estimate.poses
-        self._covariances[:count] = pack_symmetric(estimate.covariances)
+        self._covariances[:count] = estimate.covariances
         self._inflation = max(self._inflation, self._step_inflation(count))
 
     def _step_inflation(self, count: int | None) -> float:
@@ -289,17 +289,15 @@ class ScanMatcher:
 
         The prior itself where too few rays are on the map, or a covariance is singular.
         """
-        options, spread = self._options, prior.covariance
-        prior_information = linear_algebra.inverse(unpack_symmetric(spread))
+        options, expected, spread = self._options, prior.mean[:POSE], prior.covariance[:POSE, :POSE]
+        prior_information = linear_algebra.inverse(spread)
         if prior_information is None:
             return prior
-        pose = prior.pose.copy()
-        deviation = math.sqrt(spread[0] + spread[3] + spread[5])  # m: the heading's at a lever arm of 1 m
+        pose = expected.copy()
+        deviation = math.sqrt(np.trace(spread))  # m: the heading's at a lever arm of 1 m
         noise_scale = self._first_noise_scale(options.annealing_deviations * deviation, likelihood)
         while True:
-            pose, derivatives = maximize_pose(
-                likelihood, rays, mount, pose, prior.pose, prior_information, noise_scale
-            )
+            pose, derivatives = maximize_pose(likelihood, rays, mount, pose, expected, prior_information, noise_scale)
             if noise_scale <= 1:
                 break
             noise_scale = max(noise_scale / 2, 1.0)
@@ -308,7 +306,7 @@ class ScanMatcher:
         covariance = linear_algebra.inverse(prior_information + derivatives.information)
         if covariance is None:
             return prior
-        change = pose - prior.pose
+        change = pose - expected
         # posterior mean of the squared Mahalanobis distance from the prior, per coordinate: 1 in expectation where
         # the prior's covariance is right
         normalized_correction = (
@@ -316,7 +314,7 @@ class ScanMatcher:
         )
         inflation = self._inflation * normalized_correction**options.inflation_rate
         self._inflation = min(max(inflation, 1.0), options.max_inflation)
-        return FilterState(pose, pack_symmetric(covariance))
+        return prior.with_pose(pose, covariance)
 
     def _first_noise_scale(self, pose_error: float, likelihood: ScanLikelihood) -> float:
         """Return the factor of the range noise with which annealing begins for poses that are off by so much (m)."""
@@ -329,7 +327,7 @@ class ScanMatcher:
         poses that the scans match best at; the range noise is multiplied by ``noise_scale`` for both.
         """
         count = len(self._node_poses)
-        terms = QuadraticTerms(np.zeros((count, 3)), np.zeros((count, 6)), np.zeros((count, 3)))
+        terms = QuadraticTerms.zeros(count)
         damping = self._options.damping_information
         total, ray_count = 0.0, 0
         for posed in self._scans:
@@ -340,16 +338,16 @@ class ScanMatcher:
             best, derivatives = maximize_pose(likelihood, rays, mount, pose, pose, damping, noise_scale)
             if derivatives.rays >= self._options.min_rays:
                 # the terms of another scan at this node have another center: their gradient is moved to this one
-                information = unpack_symmetric(terms.information[node])
-                terms.gradients[node] += derivatives.gradient - information @ (best - terms.centers[node])
-                terms.information[node] += pack_symmetric(derivatives.information)
+                change = best - terms.centers[node]
+                terms.gradients[node] += derivatives.gradient - terms.information[node] @ change
+                terms.information[node] += derivatives.information
                 terms.centers[node] = best
         return total / max(ray_count, 1), terms
 
     def _corrected(self) -> LaserPoses:
         """Return the laser's poses; their covariances are the smoother's, plus that of the map frame's own pose."""
         carriers = self._node_poses[self._node_of_scan]
-        carrier_covariances = unpack_symmetric(self._covariances[self._node_of_scan])
+        carrier_covariances = self._covariances[self._node_of_scan]
         poses = compose_poses(carriers, self._mounts)
         covariances = compose_covariances(carrier_covariances, carriers, self._mounts)
         # the variance of a surface's place within its cell, which the map does not resolve

@@ -22,7 +22,6 @@ from prim.arrays import FloatArray
 from prim.compiled import inline, kernel
 from prim.scan import PosedScan, Scan
 from prim.se2 import compose_poses, relative_poses
-from replay.poses.kalman import unpack_symmetric
 
 
 @dataclass(frozen=True)
@@ -228,7 +227,8 @@ def register_pairs(
     result = np.zeros((len(pairs), 11))
     limits = max_distance, std, options.min_cosine, options.robustness
     _register(points, starts, pairs, relative, limits, result)
-    return PairTerms(result[:, :3], unpack_symmetric(result[:, 3:9]), result[:, 9], result[:, 10])
+    information = result[:, [3, 4, 5, 4, 6, 7, 5, 7, 8]].reshape(-1, 3, 3)  # of xx, xy, xt, yy, yt, tt
+    return PairTerms(result[:, :3], information, result[:, 9], result[:, 10])
 
 
 @inline

@@ -7,13 +7,14 @@ import re
 import shlex
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from prim.arrays import FloatArray, Stamps
 from prim.errors import LogReadError
 from prim.log.decoding.codecs import Content
-from prim.log.decoding.values import StampedVector, planar_pose
+from prim.log.decoding.values import StampedFix, StampedOrientation, StampedVector, planar_pose
 from prim.log.messages import TRUE_POSE_TOPIC
 from prim.log.source import LogSource, Topic
 from prim.se2 import MAX_COORDINATE, Trajectory
@@ -22,6 +23,7 @@ from replay.poses.transforms import is_valid_pose
 
 GPS_CONTENTS = (Content.POINT, Content.FIX)
 COMPASS_CONTENTS = (Content.VECTOR,)
+IMU_CONTENTS = (Content.ORIENTATION,)
 REST_HINT = "to map with the robot at rest give --standing-still"
 SCANS_HINT = "find them by the scans alone: --pose scans"
 """What helps where there are no poses."""
@@ -69,9 +71,12 @@ class SensorReadings:
     Attributes:
         topic: The topic's name.
         stamps: (N,) ns, strictly rising.
-        values: Positions in m, (N, 3) of points and (N, 2) of satellite fixes; or vectors (N, 3) that point north.
+        values: Positions in m, (N, 3) of points and (N, 2) of satellite fixes; or vectors (N, 3) that point north; or
+            the sensor's orientations (N, 4), unit quaternions x, y, z, w.
         frame_id: The sensor's frame.
         skipped: How many messages cannot be used.
+        stds: Stated standard deviations (N,) of positions along each axis (m), NaN where there is none; None where
+            the messages have none.
     """
 
     topic: str
@@ -79,6 +84,7 @@ class SensorReadings:
     values: FloatArray
     frame_id: str
     skipped: int = 0
+    stds: FloatArray | None = None
 
     @property
     def notes(self) -> tuple[str, ...]:
@@ -94,28 +100,44 @@ class SensorLogs:
         odometry: The odometry, if any.
         gps: The position fixes, if any.
         compass: The north vectors, if any.
+        imu: The orientations of an IMU, if any and if there is no compass.
         notes: What a user should know.
     """
 
     odometry: OdometryLog | None
     gps: SensorReadings | None
     compass: SensorReadings | None
+    imu: SensorReadings | None = None
     notes: tuple[str, ...] = ()
 
     @property
     def topics(self) -> str:
         """The topics, as a list for people."""
-        return ", ".join(sensor.topic for sensor in (self.odometry, self.gps, self.compass) if sensor)
+        return ", ".join(sensor.topic for sensor in (self.odometry, self.gps, self.compass, self.imu) if sensor)
 
 
-def read_sensors(log: LogSource, odometry: Topic | None, gps: Topic | None, compass: Topic | None) -> SensorLogs:
+class SensorTopics(NamedTuple):
+    """The topics of sensors; None for those that are not there, or not asked for.
+
+    Attributes:
+        odometry: Of odometry.
+        gps: Of position fixes.
+        compass: Of north vectors.
+        imu: Of an IMU's orientations.
+    """
+
+    odometry: Topic | None
+    gps: Topic | None
+    compass: Topic | None
+    imu: Topic | None
+
+
+def read_sensors(log: LogSource, topics: SensorTopics) -> SensorLogs:
     """Read the sensors' topics.
 
     Args:
         log: The log.
-        odometry: The topic of odometry, if any.
-        gps: The topic of position fixes, if any.
-        compass: The topic of north vectors, if any.
+        topics: The sensors' topics.
 
     Returns:
         The sensors that have usable readings.
@@ -123,16 +145,15 @@ def read_sensors(log: LogSource, odometry: Topic | None, gps: Topic | None, comp
     Raises:
         LogReadError: A message is damaged, or no pose of the odometry can be used.
     """
-    poses = read_odometry(log, odometry) if odometry else None
-    fixes = read_gps(log, gps) if gps else None
-    norths = read_compass(log, compass) if compass else None
-    notes = sum((sensor.notes for sensor in (poses, fixes, norths) if sensor), ())
-    return SensorLogs(
-        poses,
-        fixes if fixes and len(fixes.stamps) else None,
-        norths if norths and len(norths.stamps) else None,
-        notes,
-    )
+    poses = read_odometry(log, topics.odometry) if topics.odometry else None
+    fixes = read_gps(log, topics.gps) if topics.gps else None
+    norths = read_compass(log, topics.compass) if topics.compass else None
+    turns = read_imu(log, topics.imu) if topics.imu else None
+    notes = sum((sensor.notes for sensor in (poses, fixes, norths, turns) if sensor), ())
+    if topics.imu and turns and not len(turns.stamps):
+        notes += (f"{topics.imu.name} has no orientations: it is not used",)
+    fixes, norths, turns = (one if one and len(one.stamps) else None for one in (fixes, norths, turns))
+    return SensorLogs(poses, fixes, norths, turns, notes)
 
 
 def find_pose_topic(log: LogSource, requested: str | None = None) -> Topic | None:
@@ -245,8 +266,24 @@ def find_compass(log: LogSource, requested: str | None = None) -> Topic | None:
     return _find(log, COMPASS_CONTENTS, COMPASS_NAMES, requested, "--compass-topic")
 
 
+def find_imu(log: LogSource, requested: str | None = None) -> Topic | None:
+    """Find the topic of an IMU's orientations.
+
+    Args:
+        log: The log.
+        requested: The topic's name; None: found by type.
+
+    Returns:
+        The topic; None where there is none.
+
+    Raises:
+        LogReadError: The requested topic is missing, or several topics fit.
+    """
+    return _find(log, IMU_CONTENTS, None, requested, "--imu-topic")
+
+
 def _find(
-    log: LogSource, contents: Sequence[Content], names: Iterable[str], requested: str | None, option: str
+    log: LogSource, contents: Sequence[Content], names: Iterable[str] | None, requested: str | None, option: str
 ) -> Topic | None:
     topics = log.holding(*contents)
     if requested is not None:
@@ -257,7 +294,9 @@ def _find(
                 log.path, f"no {' or '.join(contents)} on {requested}", f"topics with such messages: {there}"
             )
         return chosen[0]
-    likely = [topic for topic in topics if not set(names).isdisjoint(re.split(r"[/_]", topic.name.lower()))]
+    likely = topics
+    if names is not None:
+        likely = [topic for topic in topics if not set(names).isdisjoint(re.split(r"[/_]", topic.name.lower()))]
     if len(likely) > 1:
         raise LogReadError(
             log.path,
@@ -280,21 +319,23 @@ def read_gps(log: LogSource, topic: Topic) -> SensorReadings:
     Raises:
         LogReadError: A message is damaged.
     """
-    satellites = topic.content is Content.FIX
-    readings = _read(log, topic, _is_on_earth if satellites else _is_near)
-    if not satellites or not len(readings.stamps):
+    if topic.content is not Content.FIX:
+        return _read(log, topic, _position, 3)
+    readings = _read(log, topic, _coordinates, 4)
+    if not len(readings.stamps):
         return readings
-    return replace(readings, values=geodetic_to_plane(readings.values))
+    stds = np.sqrt(readings.values[:, 3])
+    return replace(readings, values=geodetic_to_plane(readings.values), stds=stds)
 
 
-def _is_near(fix: StampedVector) -> bool:
-    """Return whether a position lies within MAX_COORDINATE; False for NaN."""
-    return abs(fix.x) <= MAX_COORDINATE and abs(fix.y) <= MAX_COORDINATE
+def _position(fix: StampedVector) -> tuple[float, ...] | None:
+    """Return a position (3,) within MAX_COORDINATE; None for others."""
+    return (fix.x, fix.y, fix.z) if abs(fix.x) <= MAX_COORDINATE and abs(fix.y) <= MAX_COORDINATE else None
 
 
-def _is_on_earth(fix: StampedVector) -> bool:
-    """Return whether there are a latitude and a longitude (degrees) that can be; False for NaN."""
-    return abs(fix.x) <= 90 and abs(fix.y) <= 360
+def _coordinates(fix: StampedFix) -> tuple[float, ...] | None:
+    """Return latitude and longitude (degrees) that can be, altitude and variance; None for others."""
+    return (fix.x, fix.y, fix.z, fix.variance) if abs(fix.x) <= 90 and abs(fix.y) <= 360 else None
 
 
 def read_compass(log: LogSource, topic: Topic) -> SensorReadings:
@@ -310,23 +351,77 @@ def read_compass(log: LogSource, topic: Topic) -> SensorReadings:
     Raises:
         LogReadError: A message is damaged.
     """
-    return _read(log, topic, lambda north: 1e-9 < math.hypot(north.x, north.y, north.z) < 1e100)
+
+    def direction(north: StampedVector) -> tuple[float, ...] | None:
+        return (north.x, north.y, north.z) if 1e-9 < math.hypot(north.x, north.y, north.z) < 1e100 else None
+
+    return _read(log, topic, direction, 3)
 
 
-def _read(log: LogSource, topic: Topic, accepts: Callable[[StampedVector], bool]) -> SensorReadings:
+def read_imu(log: LogSource, topic: Topic) -> SensorReadings:
+    """Read the orientations of an IMU.
+
+    Args:
+        log: The log.
+        topic: A topic of orientations.
+
+    Returns:
+        Unit quaternions; messages without an orientation are left out, and do not count as skipped.
+
+    Raises:
+        LogReadError: A message is damaged.
+    """
+    return _read(log, topic, _unit_quaternion, 4, lambda message: message.rotation is not None)
+
+
+def _unit_quaternion(message: StampedOrientation) -> tuple[float, ...] | None:
+    """Return a rotation of unit norm; None for what is no rotation."""
+    rotation = message.rotation or (0.0,) * 4
+    norm = math.hypot(*rotation)
+    return tuple(value / norm for value in rotation) if 0.5 < norm < 2 else None
+
+
+def _read(
+    log: LogSource,
+    topic: Topic,
+    values_of: Callable[[Any], tuple[float, ...] | None],
+    columns: int,
+    is_there: Callable[[Any], bool] = lambda _: True,
+) -> SensorReadings:
     """Read the usable values of a topic by rising stamp; of those with the same stamp the last remains."""
-    values: dict[int, tuple[float, float, float]] = {}
+    values: dict[int, tuple[float, ...]] = {}
     frame_id = ""
     skipped = 0
     for _, message in log.decoded(topic):
-        if accepts(message):
-            values[message.stamp] = message.x, message.y, message.z
+        if not is_there(message):
+            continue
+        row = values_of(message)
+        if row is not None:
+            values[message.stamp] = row
             frame_id = message.frame_id.lstrip("/")
         else:
             skipped += 1
     stamps = sorted(values)
-    ordered = np.array([values[stamp] for stamp in stamps]).reshape(-1, 3)
+    ordered = np.array([values[stamp] for stamp in stamps]).reshape(-1, columns)
     return SensorReadings(topic.name, np.array(stamps, dtype=np.int64), ordered, frame_id, skipped)
+
+
+def imu_headings(readings: SensorReadings, rotation: FloatArray) -> FloatArray:
+    """Compute the robot's headings from the orientations of an IMU; where 0 is may be anywhere.
+
+    Args:
+        readings: N unit quaternions.
+        rotation: The IMU's rotation on the robot (3, 3).
+
+    Returns:
+        Headings (N,) in rad, without jumps of a turn.
+    """
+    x, y, z, w = readings.values.T
+    # the robot's x axis in the frame of the IMU, turned by its orientation
+    ax, ay, az = rotation[0]
+    east = (1 - 2 * (y * y + z * z)) * ax + 2 * (x * y - w * z) * ay + 2 * (x * z + w * y) * az
+    north = 2 * (x * y + w * z) * ax + (1 - 2 * (x * x + z * z)) * ay + 2 * (y * z - w * x) * az
+    return np.unwrap(np.arctan2(north, east))
 
 
 def compass_headings(readings: SensorReadings, rotation: FloatArray) -> FloatArray:

@@ -28,7 +28,7 @@ def replayed(name: str, **options: Any) -> prim.Result:
     [
         ("filezstd", None),
         ("foxglove_protobuf", None),
-        ("gps_gentle", "scans do not fit each other by fused poses: 59% of their points"),
+        ("gps_gentle", "together show the robot's way no better than /odom alone, which is used"),
         ("inc0", "angle_increment contradicts angle_min and angle_max in 120 scans"),
         ("msgzstd", None),
         ("multiecho", None),
@@ -80,5 +80,11 @@ def test_messages_of_ros1_in_mcap_are_read() -> None:
 
 def test_scans_of_two_scanners_are_matched_as_those_of_one_robot() -> None:
     result = replayed("two_lidars", match_scans=True)
-    assert sorted(str(primitive.kind) for primitive in result.primitives) == ["circle", "square"]
+    kinds = sorted(str(primitive.kind) for primitive in result.primitives)
+    assert kinds in (["circle", "square"], ["circle", "rectangle"])  # matched poses are off by millimetres
+    for primitive in result.primitives:
+        sizes = [*primitive.size.values()]
+        assert sizes == pytest.approx(
+            [0.15 if len(sizes) == 1 and primitive.theta is None else 0.25] * len(sizes), abs=0.01
+        )
     assert result.grid.frame.rows < 320

@@ -30,7 +30,9 @@ class Content(StrEnum):
     VECTOR = "vectors"
     """A StampedVector."""
     FIX = "satellite fixes"
-    """A StampedVector in degrees."""
+    """A :class:`.values.StampedFix`."""
+    ORIENTATION = "orientations"
+    """A :class:`.values.StampedOrientation`."""
     PRIMITIVES = "primitives"
     """A :class:`.values.StampedPrimitives`."""
 
@@ -63,6 +65,7 @@ _ROS: dict[str, tuple[Content, Callable[[CdrReader], Any]]] = {
     "geometry_msgs/msg/PointStamped": (Content.POINT, ros.read_vector),
     "geometry_msgs/msg/Vector3Stamped": (Content.VECTOR, ros.read_vector),
     "sensor_msgs/msg/NavSatFix": (Content.FIX, ros.read_fix),
+    "sensor_msgs/msg/Imu": (Content.ORIENTATION, ros.read_orientation),
     "visualization_msgs/msg/MarkerArray": (Content.PRIMITIVES, ros.read_primitives),
 }
 """What the messages of ROS hold, by the names of their types in ROS 2, and how each is read."""

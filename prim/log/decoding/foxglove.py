@@ -17,11 +17,12 @@ from prim import strict_json
 from prim.log.decoding.cdr import MAX_ITEMS, SECOND
 from prim.log.decoding.values import (
     PointCloud,
+    StampedFix,
     StampedPose,
-    StampedVector,
     checked_count,
     checked_stamp,
     planar_pose,
+    plane_variance,
 )
 from prim.scan import MAX_BEAMS, Scan
 from prim.se2 import Pose2D
@@ -267,10 +268,14 @@ def read_pose(message: Any) -> list[StampedPose]:
     return [_pose(message.pose, read_stamp(message), _text(message.frame_id), "")]
 
 
-def read_fix(message: Any) -> StampedVector:
-    """Read a foxglove.LocationFix: latitude and longitude (degrees), altitude (m)."""
+def read_fix(message: Any) -> StampedFix:
+    """Read a foxglove.LocationFix: latitude, longitude, altitude and their variance in the plane."""
     place = (_number(message.latitude), _number(message.longitude), _number(message.altitude))
-    return StampedVector(read_stamp(message), _text(message.frame_id), *place)
+    covariance = message.position_covariance
+    numbers = [_number(value) for value in covariance] if len(covariance) == 9 else []
+    kind = message.position_covariance_type
+    variance = plane_variance(numbers, not isinstance(kind, _Missing) and kind not in (0, "UNKNOWN"))
+    return StampedFix(read_stamp(message), _text(message.frame_id), *place, variance)
 
 
 def read_stamp(message: Any) -> int:

@@ -19,11 +19,14 @@ from prim.log.decoding.cdr import SECOND, CdrError, CdrReader
 from prim.log.decoding.ros1 import Ros1Reader
 from prim.log.decoding.values import (
     PointCloud,
+    StampedFix,
+    StampedOrientation,
     StampedPose,
     StampedPrimitives,
     StampedVector,
     checked_count,
     planar_pose,
+    plane_variance,
 )
 from prim.scan import MAX_BEAMS, Scan
 from prim.shapes import Primitive
@@ -142,13 +145,24 @@ def read_vector(fields: CdrReader) -> StampedVector:
     return StampedVector(*fields.header(), *fields.unpack("3d", 8))
 
 
-def read_fix(fields: CdrReader) -> StampedVector:
-    """Read latitude, longitude and altitude of a sensor_msgs/NavSatFix; NaN without a fix."""
-    header = fields.header()
+def read_fix(fields: CdrReader) -> StampedFix:
+    """Read latitude, longitude, altitude and their variance in the plane of a sensor_msgs/NavSatFix."""
+    stamp, frame_id = fields.header()
     status = fields.unpack("b", 1)[0]
     fields.unpack("H", 2)
-    place = fields.unpack("3d", 8)
-    return StampedVector(*header, *(place if status >= 0 else (math.nan,) * 3))
+    latitude, longitude, altitude = fields.unpack("3d", 8)
+    if status < 0:
+        latitude = longitude = altitude = math.nan
+    covariance = fields.unpack("9d", 8)
+    variance = plane_variance(covariance, fields.unpack("B", 1)[0] > 0)
+    return StampedFix(stamp, frame_id, latitude, longitude, altitude, variance)
+
+
+def read_orientation(fields: CdrReader) -> StampedOrientation:
+    """Read the orientation of a sensor_msgs/Imu, which has none where its covariance begins with -1."""
+    header = fields.header()
+    x, y, z, w = fields.unpack("4d", 8)
+    return StampedOrientation(*header, (x, y, z, w) if fields.unpack("9d", 8)[0] != -1 else None)
 
 
 def read_pose_stamped(fields: CdrReader) -> list[StampedPose]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import NamedTuple
 
 from prim.arrays import FloatArray
@@ -49,6 +50,40 @@ class StampedVector(NamedTuple):
     z: float
 
 
+class StampedFix(NamedTuple):
+    """A position on the Earth as messages hold it.
+
+    Attributes:
+        stamp: Ns.
+        frame_id: The frame of the antenna.
+        x: Latitude (degrees); NaN without a fix.
+        y: Longitude (degrees); NaN without a fix.
+        z: Altitude (m); NaN without a fix.
+        variance: Of the position along each axis in the plane (m^2), as the receiver has it; NaN where it has none.
+    """
+
+    stamp: int
+    frame_id: str
+    x: float
+    y: float
+    z: float
+    variance: float
+
+
+class StampedOrientation(NamedTuple):
+    """An orientation as messages hold it.
+
+    Attributes:
+        stamp: Ns.
+        frame_id: The frame of the sensor.
+        rotation: The sensor's orientation, a quaternion x, y, z, w as the message holds it; None where it has none.
+    """
+
+    stamp: int
+    frame_id: str
+    rotation: tuple[float, float, float, float] | None
+
+
 class PointCloud(NamedTuple):
     """A cloud of points.
 
@@ -85,6 +120,22 @@ def planar_pose(pose: StampedPose) -> Pose2D:
 def quaternion(heading: float) -> tuple[float, float, float, float]:
     """Return the quaternion x, y, z, w of a turn about the z axis (rad)."""
     return 0.0, 0.0, math.sin(heading / 2), math.cos(heading / 2)
+
+
+def plane_variance(covariance: Sequence[float], is_known: bool) -> float:
+    """Find the variance of a position in the plane.
+
+    Args:
+        covariance: That of x, y, z: (9,) in m^2.
+        is_known: Whether the message says that it is.
+
+    Returns:
+        The mean along x and y; NaN where it is not known, or cannot be one.
+    """
+    if not is_known or len(covariance) != 9:
+        return math.nan
+    variance = (covariance[0] + covariance[4]) / 2
+    return variance if min(covariance[0], covariance[4]) > 0 and variance < math.inf else math.nan
 
 
 def checked_count(points: int) -> int:

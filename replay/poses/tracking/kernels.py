@@ -21,6 +21,9 @@ X, Y, NORMAL_X, NORMAL_Y = range(4)
 FULL_SCORE = 255
 """The score of a point that lies on one of the map."""
 
+SCORE_STEPS, SCORE_REACH = 1024, 4.5
+"""Scores are taken from a table of so many steps, of squared distances up to this (in those of two widths)."""
+
 
 class LineRule(NamedTuple):
     """Which beams are neighbours on one line; see PointOptions."""
@@ -49,12 +52,14 @@ class Fit(NamedTuple):
         residual: Standard deviation (m) that residuals count by.
         min_cosine: Least cosine between normals of corresponding points.
         point_weight: Weight of points on no line.
+        enough: No step follows one that is shorter than this (m, half as much in rad).
     """
 
     kernels: FloatArray
     residual: float
     min_cosine: float
     point_weight: float
+    enough: float
 
 
 class Window(NamedTuple):
@@ -192,19 +197,22 @@ def note_nearest(points: Any, grid: Any, reach: float, squares: Any, nearest: An
         nearest: (rows, cols) indices of points, changed in place.
     """
     rows, cols = squares.shape
-    around = math.ceil(reach / grid.cell)
+    around, cell, limit = math.ceil(reach / grid.cell), np.float32(grid.cell), np.float32(reach * reach)
     for n in range(len(points)):
-        x, y = points[n, X], points[n, Y]
-        col, row = math.floor((x - grid.x) / grid.cell), math.floor((y - grid.y) / grid.cell)
+        x, y = points[n, X] - grid.x, points[n, Y] - grid.y
+        col, row = math.floor(x / grid.cell), math.floor(y / grid.cell)
         if col < around or row < around or col >= cols - around or row >= rows - around:
             continue
+        first = np.float32((col - around + 0.5) * grid.cell - x)
         for j in range(row - around, row + around + 1):
-            dy = grid.y + (j + 0.5) * grid.cell - y
-            for i in range(col - around, col + around + 1):
-                dx = grid.x + (i + 0.5) * grid.cell - x
+            dy = np.float32((j + 0.5) * grid.cell - y)
+            own, held = squares[j, col - around : col + around + 1], nearest[j, col - around : col + around + 1]
+            for i in range(2 * around + 1):  # without branches, so that the compiler takes several at once
+                dx = first + np.float32(i) * cell
                 square = dx * dx + dy * dy
-                if square <= reach * reach and square < squares[j, i]:
-                    squares[j, i], nearest[j, i] = square, n
+                is_nearer = (square <= limit) & (square < own[i])
+                own[i] = square if is_nearer else own[i]
+                held[i] = np.int32(n) if is_nearer else held[i]
 
 
 @inline
@@ -345,6 +353,8 @@ def fit_pose(
         shrink = 0.5 / length if length > 0.5 else 1.0
         for i in range(3):
             pose[i] += shrink * step[i]
+        if length < fit.enough and fit.kernels[k] == fit.kernels[-1]:
+            break
     return add_residuals(points, pose, surface, nearest, grid, fit, fit.kernels[-1], out, vector)
 
 
@@ -358,10 +368,14 @@ def score_cells(squares: Any, blur: float, out: Any) -> None:
         out: (rows, cols) uint8, gets the scores.
     """
     rows, cols = squares.shape
+    table = np.empty(SCORE_STEPS + 1, np.uint8)
+    for k in range(SCORE_STEPS):
+        table[k] = np.uint8(FULL_SCORE * math.exp(-(k + 0.5) * SCORE_REACH / SCORE_STEPS))
+    table[SCORE_STEPS] = 0
+    scale = np.float32(SCORE_STEPS / SCORE_REACH / (2.0 * blur * blur))
     for j in range(rows):
         for i in range(cols):
-            square = squares[j, i] / (2.0 * blur * blur)
-            out[j, i] = 0 if square > 4.5 else np.uint8(FULL_SCORE * math.exp(-square))
+            out[j, i] = table[np.int32(min(squares[j, i] * scale, np.float32(SCORE_STEPS)))]
 
 
 @kernel
@@ -375,10 +389,11 @@ def pool_scores(scores: Any, step: int, out: Any) -> None:
     """
     rows, cols = scores.shape
     for j in range(rows):
-        below = min(j + step, rows - 1)
-        for i in range(cols):
-            right = min(i + step, cols - 1)
-            out[j, i] = max(scores[j, i], scores[j, right], scores[below, i], scores[below, right])
+        upper, lower, row = scores[j], scores[min(j + step, rows - 1)], out[j]
+        for i in range(cols - step):
+            row[i] = max(max(upper[i], upper[i + step]), max(lower[i], lower[i + step]))
+        for i in range(max(cols - step, 0), cols):
+            row[i] = max(max(upper[i], upper[cols - 1]), max(lower[i], lower[cols - 1]))
 
 
 @inline

@@ -8,9 +8,10 @@ from dataclasses import replace
 import numpy as np
 
 from prim.arrays import FloatArray
-from prim.se2 import Trajectory, compose_poses, inverse_poses, path_length, wrap_angles
+from prim.se2 import Trajectory, compose_poses, inverse_poses, path_length, relative_poses, wrap_angles
 from replay.poses.laser_poses import SCANS, LaserPoses, LoopCounts, PosedScanSource, ScanTimes
 from replay.poses.loops.loop_closing import ClosedLoops
+from replay.poses.odometry_errors import OdometryErrors, find_odometry_errors
 from replay.poses.tracking.options import DEFAULTS, TrackingOptions
 from replay.poses.tracking.scan_tracker import ScanTrack, track
 
@@ -42,8 +43,48 @@ def track_poses(
     placed, found = _tracked(poses, mounts, times, source, not alone, settled_noise, options)
     if alone and placed.end_poses is not None:  # how the laser moves during a sweep is known now
         placed, found = _tracked(placed, mounts, times, source, True, settled_noise, options)
+    if not alone:
+        found = replace(found, odometry_errors=_odometry_errors(poses, placed, mounts, times))
     notes = track_notes(found, None if alone else poses, times)
     return replace(placed, notes=(*poses.notes, *notes)), found
+
+
+def corrected_odometry(poses: LaserPoses, times: ScanTimes, errors: OdometryErrors) -> LaserPoses:
+    """Take the scales that were found out of poses by odometry.
+
+    Args:
+        poses: The laser's poses at N scans by odometry.
+        times: When the scans were taken.
+        errors: What is wrong with the odometry.
+
+    Returns:
+        The poses, from the same first one on, with notes.
+    """
+    if not errors.has_scales:
+        return replace(poses, notes=(*poses.notes, *errors.notes(poses.origin)))
+    mounts, order = _mounts_of(poses), np.flatnonzero(poses.valid)
+    order = order[np.argsort(times.stamps[order], kind="stable")]
+    corrected = poses.poses.copy()
+    robot = errors.corrected(compose_poses(poses.poses, inverse_poses(mounts))[order])
+    corrected[order] = compose_poses(robot, mounts[order])
+    corrected[:, 2] = wrap_angles(corrected[:, 2])
+    ends = poses.end_poses
+    if ends is not None:
+        ends = compose_poses(corrected, relative_poses(poses.poses, ends))
+    return replace(poses, poses=corrected, end_poses=ends, notes=(*poses.notes, *errors.notes(poses.origin)))
+
+
+def _odometry_errors(
+    odometry: LaserPoses, placed: LaserPoses, mounts: FloatArray, times: ScanTimes
+) -> OdometryErrors:
+    """Find what is wrong with an odometry all the time, by poses that were tracked."""
+    first = True if times.scanner is None else times.scanner == 0
+    at = np.flatnonzero(odometry.valid & placed.valid & first)
+    at = at[np.argsort(times.stamps[at], kind="stable")]
+    at = at[np.diff(times.stamps[at], prepend=times.stamps[at[:1]] - 1) > 0]
+    backs = inverse_poses(mounts[at])
+    by_odometry, tracked = (compose_poses(poses.poses[at], backs) for poses in (odometry, placed))
+    return find_odometry_errors(times.stamps[at], by_odometry, tracked)
 
 
 def _tracked(
@@ -106,6 +147,7 @@ def track_notes(found: ScanTrack, odometry: LaserPoses | None, times: ScanTimes)
     count, begin = len(found.poses), times.stamps.min()
     if odometry is not None:
         given, tracked = path_length(odometry.poses[odometry.valid]), path_length(found.poses)
+        notes += found.odometry_errors.notes(odometry.origin)
         if found.stands_still:
             notes.append(
                 f"{odometry.origin} moves by {given:.2f} m where the scans move by {tracked:.1f} m: they are followed"

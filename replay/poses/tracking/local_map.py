@@ -63,7 +63,9 @@ class LocalMap:
         self._scores: FloatArray | None = None
         widths = np.ones(options.steps + 1)
         widths[: len(options.widening)] = options.widening
-        self._fit = Fit(options.kernel * widths, options.residual, options.min_cosine, options.point_weight)
+        self._fit = Fit(
+            options.kernel * widths, options.residual, options.min_cosine, options.point_weight, options.enough
+        )
 
     def match(
         self,

@@ -50,7 +50,8 @@ class LocalMapOptions:
         turn: The step of headings (rad) in a search.
         kernel: Residuals lose weight beyond this (m): Welsch's function. It is wider at first.
         widening: By how much, in the first steps.
-        steps: Gauss and Newton's steps.
+        steps: Gauss and Newton's steps at most …
+        enough: … until one is shorter than this (m, half as much in rad).
         min_cosine: Points correspond where the cosine between their normals is no less.
         point_weight: Weight of points without a line, beside those on one.
         residual: Standard deviation of residuals (m) beside which a prior counts.
@@ -67,6 +68,7 @@ class LocalMapOptions:
     kernel: float = 0.05
     widening: tuple[float, ...] = (3.0, 3.0, 1.7, 1.7)
     steps: int = 10
+    enough: float = 2e-5
     min_cosine: float = 0.3
     point_weight: float = 0.15
     residual: float = 0.03
@@ -124,6 +126,9 @@ class TrackingOptions:
         sure_score: … where scans have a median score above this.
         least_path: Where scans move by more than this (m) …
         least_share: … and odometry by less than this share of it, it is taken to stand still.
+        least_spread: Scans show the odometry's noise where they are so far (m) from those before them …
+        least_windows: … and so many are …
+        least_odometry_std: … but none less than this after one metre (m, rad).
     """
 
     points: PointOptions = field(default_factory=PointOptions)
@@ -171,6 +176,9 @@ class TrackingOptions:
     sure_score: float = 0.8
     least_path: float = 0.5
     least_share: float = 0.1
+    least_spread: float = 0.01
+    least_windows: int = 12
+    least_odometry_std: tuple[float, float] = (0.005, math.radians(0.3))
 
 
 DEFAULTS = TrackingOptions()

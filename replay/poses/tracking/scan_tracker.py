@@ -21,6 +21,7 @@ from prim.se2 import compose_poses, path_length, relative_poses, wrap_angles
 from replay.poses.loops.loop_closing import ClosedLoops, LoopCloser
 from replay.poses.loops.loop_errors import LoopErrors
 from replay.poses.loops.submaps import Keyframes
+from replay.poses.odometry_errors import NO_ERRORS, OdometryErrors
 from replay.poses.scan_registration import range_noise
 from replay.poses.tracking.kernels import Window
 from replay.poses.tracking.local_map import LocalMap, Match, joined
@@ -44,6 +45,7 @@ class ScanTrack:
         fits: Whether scans fit well, and none is lost.
         overrules: Whether these poses are better than the odometry's: that stands still, or was often not followed,
             and scans fit well.
+        odometry_errors: What is wrong with the odometry all the time.
         errors: What is unsure about the poses; None where scans were not matched anew in the end.
         closed: The loops that were closed, and how many were rejected; None where none were searched for.
     """
@@ -57,6 +59,7 @@ class ScanTrack:
     stands_still: bool = False
     fits: bool = True
     overrules: bool = False
+    odometry_errors: OdometryErrors = NO_ERRORS
     errors: TrackErrors | None = None
     closed: ClosedLoops | None = None
 
@@ -100,8 +103,8 @@ def track(
         stands_still,
         fits,
         is_wrong and fits,
-        tracker.errors() if noise_std < settled_noise else None,
-        tracker.closed,
+        errors=tracker.errors() if noise_std < settled_noise else None,
+        closed=tracker.closed,
     )
 
 

@@ -9,11 +9,12 @@ from filterpy.kalman import ExtendedKalmanFilter
 
 from prim.arrays import FloatArray, Stamps
 from prim.metrics import pose_nees, pose_rmse
-from prim.se2 import Trajectory, integrate_steps, wrap_angles
+from prim.se2 import Trajectory, integrate_steps, relative_poses, relative_steps, wrap_angles
 from replay.poses.fusion import Fusion, PoseEstimate
+from replay.poses.fusion_filter import filter_nodes
 from replay.poses.fusion_nodes import FusionNodes, weighted_path_lengths
 from replay.poses.fusion_options import FusionOptions, NoiseEstimationOptions, SensorNoise
-from replay.poses.kalman import REJECTED, FilterState
+from replay.poses.kalman import REJECTED, FilterState, smooth
 
 SECOND = 10**9
 TRUE_NOISE = SensorNoise(0.1, math.radians(3), 0.05, math.radians(2), 0.0)
@@ -29,12 +30,21 @@ class Drive:
     fixes: FloatArray
     headings: FloatArray
 
-    def nodes(self, odometry: bool = True, gps: bool = True, compass: bool = True) -> FusionNodes:
+    def nodes(
+        self,
+        odometry: bool = True,
+        gps: bool = True,
+        compass: bool = True,
+        fix_stds: FloatArray | None = None,
+        has_north: bool = True,
+    ) -> FusionNodes:
         return FusionNodes.from_readings(
             self.stamps,
             self.odometry if odometry else None,
             (self.stamps, self.fixes) if gps else None,
             (self.stamps, self.headings) if compass else None,
+            fix_stds=fix_stds,
+            has_north=has_north,
         )
 
     def errors(self, estimate: PoseEstimate) -> tuple[float, float]:
@@ -63,7 +73,7 @@ def test_filter_agrees_with_filterpy() -> None:
     filtered = fusion.filtered()
     other = ExtendedKalmanFilter(3, 2)
     initial = fusion.initial_state
-    other.x, other.P = initial.pose, np.diag(initial.covariance[[0, 3, 5]])
+    other.x, other.P = initial.mean, initial.covariance
     nodes = fusion.nodes
     for k in range(len(nodes.stamps)):
         step, distance = nodes.steps[k], nodes.variance_scales[k]
@@ -108,9 +118,9 @@ def test_smoother_and_frame_covariance_agree_with_the_joint_posterior() -> None:
             information[at, at - 3] -= 1 / variances
             information[at - 3, at] -= 1 / variances
     # the filter makes a step before the first node as well
-    first = 1 / (initial.covariance[[0, 3, 5]] + 1e-10 + variances - 1e-10)
+    first = 1 / (initial.covariance.diagonal() + 1e-10 + variances - 1e-10)
     information[:3, :3] += np.diag(first)
-    vector[:3] += first * initial.pose
+    vector[:3] += first * initial.mean
     covariance = np.linalg.inv(information)
     assert found.poses.ravel() == pytest.approx(covariance @ vector, abs=1e-8)
     for k in range(count):
@@ -119,7 +129,7 @@ def test_smoother_and_frame_covariance_agree_with_the_joint_posterior() -> None:
     motion = np.hstack([[[1, 0, y], [0, 1, -x], [0, 0, 1]] for x, y, _ in poses]) / count
     assert found.frame_covariance(stamps) == pytest.approx(motion @ covariance @ motion.T, rel=1e-6, abs=1e-12)
 
-    known = FilterState(np.array([2.0, -1.0, 1.3]), np.array([1e-6, 0, 0, 4e-6, 0, 9e-6]))
+    known = FilterState(np.array([2.0, -1.0, 1.3]), np.diag([1e-6, 4e-6, 9e-6]))
     moved = found.seen_from_first(known)
     turn = np.array([[math.cos(t := 1.3 - poses[0, 2]), -math.sin(t), 0], [math.sin(t), math.cos(t), 0], [0, 0, 1]])
     for k, (x, y, theta) in enumerate(poses - poses[0]):
@@ -288,3 +298,149 @@ def test_gates_reject_one_in_a_thousand() -> None:
         0.001, abs=4e-4
     )
     assert np.mean(rng.standard_normal(100_000) ** 2 > options.heading_gate) == pytest.approx(0.001, abs=4e-4)
+
+
+def wandering(rng: np.random.Generator, count: int, std: float, time: float, columns: int = 2) -> FloatArray:
+    """Errors (count, columns) of a first-order Gauss-Markov process, ten a second."""
+    left = math.exp(-0.1 / time)
+    errors = rng.normal(0, std, (count, columns))
+    errors[1:] *= math.sqrt(1 - left**2)
+    for k in range(1, count):
+        errors[k] += left * errors[k - 1]
+    return errors
+
+
+def test_smoother_of_wandering_errors_agrees_with_the_joint_posterior() -> None:
+    """As without them: the problem is linear where the robot does not move."""
+    rng = np.random.default_rng(3)
+    count, std, time = 10, 0.4, 3.0
+    stamps = np.arange(count) * SECOND
+    still = Trajectory(stamps, np.tile([0.4, 0.2, 0.1], (count, 1)))
+    fixes = 0.3 + rng.normal(0, 0.1, (count, 2))
+    nodes = FusionNodes.from_readings(stamps, still, (stamps, fixes), (stamps, np.full(count, 0.1)))
+    noise = np.ones(11)
+    noise[:5] = 0.1, 0.05, 0.02, 0.03, 0.0
+    noise[[7, 8, 9]] = std, time, 0.0
+    output = filter_nodes(nodes, noise, FilterState(np.array([0.3, 0.3, 0.1]), 0.25 * np.eye(3)), FusionOptions())
+    gains = np.zeros_like(output.covariances)
+    smooth(output, gains)
+    left = math.exp(-1 / time)
+    # x and its error at each node: a random walk of the one, and a decay of the other
+    information, vector = np.zeros((2 * count, 2 * count)), np.zeros(2 * count)
+    for k in range(count):
+        both = slice(2 * k, 2 * k + 2)
+        information[both, both] += 100.0
+        vector[both] += 100.0 * fixes[k, 0]
+        walk = nodes.variance_scales[k] * 0.02**2 + 1e-10
+        for at, kept, variance in (
+            (2 * k, 1.0, 0.25 + walk if k == 0 else walk),
+            (2 * k + 1, left, std**2 + 2e-10 if k == 0 else std**2 * (1 - left**2) + 1e-10),
+        ):
+            information[at, at] += 1 / variance
+            if k:
+                information[at - 2, at - 2] += kept**2 / variance
+                information[at, at - 2] -= kept / variance
+                information[at - 2, at] -= kept / variance
+            elif at == 0:
+                vector[0] += 0.3 / variance
+    covariance = np.linalg.inv(information)
+    mean = covariance @ vector
+    assert output.means[:, [0, 3]].ravel() == pytest.approx(mean, abs=1e-6)
+    for k in range(count):
+        assert output.covariances[k][np.ix_([0, 3], [0, 3])] == pytest.approx(
+            covariance[2 * k : 2 * k + 2, 2 * k : 2 * k + 2], rel=1e-5
+        )
+
+
+def test_wandering_errors_follow_what_is_learnt_of_the_pose() -> None:
+    root = np.random.default_rng(0).normal(size=(6, 6))
+    belief = FilterState(np.arange(6.0), root @ root.T)
+    seen, variances = np.array([0.5, 0.7, 2.5]), np.diag([0.1, 0.2, 0.3])
+    # a measurement of the pose by which its posterior is what is given
+    before = belief.covariance[:3, :3]
+    added = np.linalg.inv(variances) - np.linalg.inv(before)
+    joint = np.linalg.inv(belief.covariance)
+    joint[:3, :3] += added
+    covariance = np.linalg.inv(joint)
+    pull = np.linalg.solve(variances, seen) - np.linalg.solve(before, belief.mean[:3])
+    mean = covariance @ (np.linalg.solve(belief.covariance, belief.mean) + np.append(pull, np.zeros(3)))
+    found = belief.with_pose(seen, variances)
+    assert found.mean == pytest.approx(mean) and found.covariance == pytest.approx(covariance)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_wandering_fixes_are_found_and_reckoned_with(seed: int) -> None:
+    driven = drive(seed, 2400)
+    fixes = driven.fixes + wandering(np.random.default_rng(100 + seed), 2400, 0.5, 10.0)
+    other = replace(driven, fixes=fixes)
+    fusion = Fusion(other.nodes(), None)
+    wander = fusion.noise.position_wander
+    assert wander is not None and 0.25 < wander.std < 1 and 3 < wander.time < 40
+    assert fusion.noise.position_std == pytest.approx(0.1, rel=0.15)
+    found = fusion.smoothed()
+    assert other.errors(found)[0] < 0.4 and pose_nees(found.poses, driven.truth, found.covariances) < 9
+    assert Fusion(driven.nodes()).noise.position_wander is None
+
+
+def test_wandering_fixes_are_known_from_a_bad_odometry_by_what_a_receiver_states() -> None:
+    driven = drive(12, 1200)
+    other = replace(driven, fixes=driven.fixes + wandering(np.random.default_rng(12), 1200, 1.5, 60.0))
+    noise = Fusion(other.nodes(compass=False, fix_stds=np.full(1200, 1.5))).noise
+    assert noise.position_wander is not None and noise.position_wander.std > 0.4
+    assert noise.odometry_translation_std == pytest.approx(0.05, rel=0.5)
+
+
+def test_fixes_count_by_what_is_stated_of_each() -> None:
+    driven, rng = drive(13), np.random.default_rng(13)
+    stds = np.where(np.arange(600) % 200 < 100, 0.02, 1.0)
+    other = replace(driven, fixes=driven.truth[:, :2] + stds[:, None] * rng.standard_normal((600, 2)))
+    found = Fusion(other.nodes(fix_stds=stds)).smoothed()
+    assert other.errors(found)[0] < 0.06 and pose_nees(found.poses, driven.truth, found.covariances) < 6
+
+
+@pytest.mark.parametrize("seed", range(2))
+def test_headings_of_an_imu_have_any_zero_and_drift(seed: int) -> None:
+    driven = drive(seed)
+    drift = np.cumsum(np.random.default_rng(seed).normal(0, 0.01, 600))
+    other = replace(driven, headings=wrap_angles(driven.headings + drift - 2.0))
+    found = Fusion(other.nodes(has_north=False)).smoothed()
+    metres, radians = driven.errors(found)
+    assert metres < 0.035 and radians < math.radians(5)
+    assert pose_nees(found.poses, driven.truth, found.covariances) < 6
+
+
+def test_scales_of_an_odometry_are_found_and_corrected() -> None:
+    driven = drive(14, 1200)
+    scaled = integrate_steps(relative_steps(driven.odometry.poses) * [1 / 1.1, 1 / 1.1, 1 / 0.9])
+    other = replace(driven, odometry=Trajectory(driven.stamps, scaled))
+    fusion = Fusion(other.nodes())
+    assert fusion.noise.distance_scale == pytest.approx(1.1, abs=0.04)
+    assert fusion.noise.turn_scale == pytest.approx(0.9, abs=0.02)
+    assert other.errors(fusion.smoothed())[0] < 0.035
+    assert Fusion(driven.nodes()).noise.distance_scale is None
+
+
+def test_smoother_is_linear_about_the_headings_that_all_fixes_give() -> None:
+    """By coarse fixes alone the heading is not known for a while, and what was guessed then must not bend the way."""
+    rng = np.random.default_rng(15)
+    angles = np.linspace(0, 2 * math.pi, 600)
+    truth = np.column_stack((1.5 * np.sin(angles), 1.5 - 1.5 * np.cos(angles), angles + 1.2))
+    cos, sin = math.cos(1.2), math.sin(1.2)
+    truth[:, :2] = truth[:, :2] @ np.array([[cos, sin], [-sin, cos]])
+    stamps = np.arange(600) * (SECOND // 10)
+    fixes = truth[:, :2] + rng.normal(0, 0.7, (600, 2))
+    odometry = Trajectory(stamps, integrate_steps(relative_steps(truth)))
+    nodes = FusionNodes.from_readings(stamps, odometry, (stamps[::10], fixes[::10]), None)
+    noise = SensorNoise(0.7, None, 0.002, 0.002)
+    found = Fusion(nodes, noise).smoothed().poses
+    seen = relative_poses(np.repeat(found[:1], 600, axis=0), found)
+    expected = relative_poses(np.repeat(truth[:1], 600, axis=0), truth)
+    assert np.abs(seen[:, :2] - expected[:, :2]).max() < 0.01
+
+
+def test_gain_over_odometry_is_what_fixes_add() -> None:
+    driven = drive(16)
+    assert Fusion(driven.nodes()).gain_over_odometry() > 2
+    coarse = replace(driven, fixes=driven.truth[:, :2] + np.random.default_rng(0).normal(0, 30, (600, 2)))
+    assert Fusion(coarse.nodes(compass=False)).gain_over_odometry() < 1.05
+    assert Fusion(driven.nodes(odometry=False)).gain_over_odometry() == math.inf

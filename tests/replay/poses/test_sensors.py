@@ -22,7 +22,17 @@ from prim.se2 import Pose2D, wrap_angles
 from replay.poses.fusion_options import FusionInputs
 from replay.poses.laser_poses import FUSED
 from replay.poses.pose_provider import PoseProvider
-from replay.poses.sensors import compass_headings, find_compass, find_gps, geodetic_to_plane, read_compass, read_gps
+from replay.poses.sensors import (
+    compass_headings,
+    find_compass,
+    find_gps,
+    find_imu,
+    geodetic_to_plane,
+    imu_headings,
+    read_compass,
+    read_gps,
+    read_imu,
+)
 from tests.replay.poses.test_pose_provider import (
     DRIVE,
     SECOND,
@@ -41,6 +51,7 @@ DRIVE_X = [(1.0, 0.0), (1.5, 1.0), (2.0, 2.0)]
 STRAIGHT = odometry("/odom", *((t, Pose2D(x, 0, 0)) for t, x in DRIVE_X))
 
 FIX_TYPE = "sensor_msgs/msg/NavSatFix"
+IMU_TYPE = "sensor_msgs/msg/Imu"
 
 
 def points(topic: str, *fixes: tuple[float, float, float], frame: str = "map") -> Write:
@@ -69,7 +80,9 @@ def north_vectors(topic: str, *angles: tuple[float, float]) -> Write:
     return write
 
 
-def satellites(topic: str, *fixes: tuple[float, float, float], status: int = 0) -> Write:
+def satellites(
+    topic: str, *fixes: tuple[float, float, float], status: int = 0, variance: float = 0.0, known: int = 0
+) -> Write:
     def write(log) -> None:  # type: ignore[no-untyped-def]
         log.add_topic(topic, FIX_TYPE)
         for seconds, latitude, longitude in fixes:
@@ -81,8 +94,8 @@ def satellites(topic: str, *fixes: tuple[float, float, float], status: int = 0) 
                 latitude=latitude,
                 longitude=longitude,
                 altitude=30.0,
-                position_covariance=np.zeros(9),
-                position_covariance_type=0,
+                position_covariance=np.diag([variance, variance, 9.0]).ravel(),
+                position_covariance_type=known,
             )
             log.write(topic, stamp, _serialize(message))
 
@@ -161,7 +174,7 @@ def test_error_without_enough_sensors_lists_the_available_ones(tmp_path: Path) -
 def test_fusion_of_odometry_alone_is_reported(tmp_path: Path) -> None:
     with log_of(tmp_path / "a.mcap", DRIVE) as log:
         located = PoseProvider(log).laser_poses(TIMES, FUSED)
-        assert "no GPS and no compass: fused poses are those of /odom" in located.notes
+        assert "no GPS, no compass and no IMU: fused poses are those of /odom" in located.notes
         assert located.poses == pytest.approx(PoseProvider(log).laser_poses(TIMES, "odom").poses, abs=1e-6)
 
 
@@ -269,3 +282,79 @@ def test_lever_arm_of_the_antenna_is_read_from_tf(tmp_path: Path) -> None:
 def test_log_without_sensors_has_no_gps_and_no_compass(tmp_path: Path) -> None:
     with log_of(tmp_path / "a.mcap", STRAIGHT) as log:
         assert find_gps(log) is None and find_compass(log) is None
+
+
+def imu(topic: str, *orientations: tuple[float, tuple[float, float, float, float]], known: bool = True) -> Write:
+    def write(log) -> None:  # type: ignore[no-untyped-def]
+        log.add_topic(topic, IMU_TYPE)
+        for seconds, (x, y, z, w) in orientations:
+            stamp = round(seconds * SECOND)
+            unknown, still = np.zeros(9), _new("geometry_msgs/msg/Vector3", x=0.0, y=0.0, z=0.0)
+            message = _new(
+                IMU_TYPE,
+                header=_header(stamp, "imu"),
+                orientation=_new("geometry_msgs/msg/Quaternion", x=x, y=y, z=z, w=w),
+                orientation_covariance=unknown if known else np.append(-1.0, np.zeros(8)),
+                angular_velocity=still,
+                angular_velocity_covariance=unknown,
+                linear_acceleration=still,
+                linear_acceleration_covariance=unknown,
+            )
+            log.write(topic, stamp, _serialize(message))
+
+    return write
+
+
+def turned(heading: float, scale: float = 1.0) -> tuple[float, float, float, float]:
+    return 0.0, 0.0, scale * math.sin(heading / 2), scale * math.cos(heading / 2)
+
+
+@pytest.mark.parametrize(("variance", "known", "std"), [(2.25, 2, 1.5), (2.25, 0, math.nan), (-1.0, 2, math.nan)])
+def test_stated_covariance_of_fixes_is_read_where_it_is_known(
+    tmp_path: Path, variance: float, known: int, std: float
+) -> None:
+    fixes = satellites("/gps/fix", (1.0, 50.0, 8.0), (1.5, 50.0, 8.0), variance=variance, known=known)
+    with log_of(tmp_path / "a.mcap", fixes) as log:
+        topic = find_gps(log)
+        assert topic is not None
+        assert read_gps(log, topic).stds == pytest.approx([std, std], nan_ok=True)
+
+
+def test_orientations_of_an_imu_are_read(tmp_path: Path) -> None:
+    good = imu("/imu", (1.0, turned(0.5)), (1.5, turned(3.1, 1.1)), (2.0, turned(-3.1)), (2.5, (0.0, 0.0, 0.0, 0.0)))
+    with log_of(tmp_path / "a.mcap", good) as log:
+        topic = find_imu(log)
+        assert topic is not None
+        readings = read_imu(log, topic)
+        assert readings.skipped == 1 and "/imu: 1 messages without a usable value" in readings.notes[0]
+        assert imu_headings(readings, np.eye(3)) == pytest.approx([0.5, 3.1, 2 * math.pi - 3.1], abs=1e-9)
+        # mounted with its y axis ahead: the robot's heading is a quarter turn further
+        ahead = np.array([[0.0, 1, 0], [-1, 0, 0], [0, 0, 1]])
+        assert imu_headings(readings, ahead)[0] == pytest.approx(0.5 + math.pi / 2)
+
+
+def test_imu_is_fused_where_it_is_asked_for_and_has_orientations(tmp_path: Path) -> None:
+    headings = imu("/imu", *((t, turned(2.0)) for t, _ in DRIVE_X))
+    with log_of(tmp_path / "a.mcap", STRAIGHT, headings) as log:
+        assert PoseProvider(log).laser_poses(TIMES).source == "odom"
+        assert PoseProvider(log).laser_poses(TIMES, FUSED).origin == "/odom, /imu"
+        assert PoseProvider(log).laser_poses(TIMES, FUSED).poses[:, 2] == pytest.approx([0, 0, 0], abs=1e-3)
+    with log_of(tmp_path / "b.mcap", STRAIGHT, COMPASS, headings) as log:
+        assert PoseProvider(log).laser_poses(TIMES, FUSED).origin == "/odom, /compass"
+        asked = PoseProvider(log, inputs=FusionInputs(imu_topic="/imu")).laser_poses(TIMES, FUSED)
+        assert asked.origin == "/odom, /imu"
+    without = imu("/imu", *((t, turned(0.0)) for t, _ in DRIVE_X), known=False)
+    with log_of(tmp_path / "c.mcap", STRAIGHT, without) as log:
+        fused = PoseProvider(log).laser_poses(TIMES, FUSED)
+        assert fused.origin == "/odom" and "/imu has no orientations: it is not used" in fused.notes
+
+
+def test_one_of_several_imus_has_to_be_chosen_where_one_is_asked_for(tmp_path: Path) -> None:
+    two = [imu(topic, *((t, turned(0.0)) for t, _ in DRIVE_X)) for topic in ("/imu/a", "/imu/b")]
+    with log_of(tmp_path / "a.mcap", STRAIGHT, GPS, *two) as log:
+        assert PoseProvider(log).laser_poses(TIMES).origin == "/odom, /gps"
+        with pytest.raises(LogReadError) as error:
+            PoseProvider(log, inputs=FusionInputs(("odom", "imu"))).laser_poses(TIMES, FUSED)
+        assert (
+            "2 topics to choose from: /imu/a, /imu/b" in error.value.what and "--imu-topic /imu/a" in error.value.hint
+        )
