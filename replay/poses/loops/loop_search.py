@@ -23,9 +23,9 @@ class LoopRejection(Enum):
     """Why a match is no loop."""
 
     AMBIGUOUS = "ambiguous"
-    ONE_SIDED = "fitting one way only"
-    UNSUPPORTED = "alone"
-    OUTLIER = "against all others"
+    ONE_SIDED = "one-sided"
+    UNSUPPORTED = "unsupported"
+    OUTLIER = "contradicted"
 
 
 class Loop(NamedTuple):

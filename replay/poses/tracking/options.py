@@ -117,6 +117,7 @@ class TrackingOptions:
             scans has of its own; by halves of the beams of two buildings (bench/poses.py).
         first_std: Those of the first pose, which is known.
         coarse_cells: In a map with larger cells than this (m) the points of scans place these better than the map.
+        closed_noise: By scans alone loops are closed in cells of any size where the range noise is below this (m).
         windows: The fit of scans is tested in so many windows …
         window_scans: … of so many scans.
         misplaced: How far poses may be off in that test (m, rad).
@@ -167,6 +168,7 @@ class TrackingOptions:
     least_std: tuple[float, float] = (0.0015, math.radians(0.06))
     first_std: float = 1e-5
     coarse_cells: float = 0.02
+    closed_noise: float = 0.03
     windows: int = 6
     window_scans: int = 12
     misplaced: tuple[float, float] = (0.1, 0.05)

@@ -408,7 +408,7 @@ def test_a_search_leaves_out_what_it_is_asked_to() -> None:
 def test_notes_say_what_was_closed_and_what_not(lap: tuple[Keyframes, FloatArray, ClosedLoops]) -> None:
     _, _, closed = lap
     seven = replace(closed, closed=7, rejected={LoopRejection.AMBIGUOUS: 2, LoopRejection.UNSUPPORTED: 1})
-    assert loop_notes(seven) == ["7 loops closed, 1 rejected as alone, 2 rejected as ambiguous"]
+    assert loop_notes(seven) == ["7 loops closed, 2 rejected as ambiguous, 1 rejected as unsupported"]
     assert loop_notes(replace(closed, closed=1, rejected={})) == ["1 loop closed"]
     none = replace(closed, closed=0, loops=(), rejected={LoopRejection.AMBIGUOUS: 3})
     assert loop_notes(none) == ["no loop closed, 3 rejected as ambiguous"]
