@@ -127,7 +127,8 @@ def _matched(found: Localization, options: ReplayOptions, timer: StageTimer) -> 
     posed = partial(pose_scans, scans, options=options, timer=timer)
     if poses.source == SCANS or _drift(poses, options.fuse.noise):
         settled_noise = options.resolution if options.resolution > TRACKING.coarse_cells else 0.0
-        tracked, track = track_poses(poses, scans.times, posed, settled_noise)
+        closed_noise = max(settled_noise, TRACKING.closed_noise) if poses.source == SCANS else settled_noise
+        tracked, track = track_poses(poses, scans.times, posed, closed_noise)
         if track.noise_std < settled_noise:
             return found._replace(poses=replace(tracked, matched=True))
         if poses.source == SCANS or track.overrules:

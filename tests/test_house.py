@@ -48,7 +48,8 @@ ARROWS: dict[str, set[str]] = {
     },
     "replay/scans": {"prim", "prim/log", "prim/log/decoding", "replay", "replay/poses"},
     "replay/poses": {"prim", "prim/log", "prim/log/decoding", "mapping", "mapping/forward"},
-    "replay/poses/tracking": {"prim", "mapping", "replay/poses"},
+    "replay/poses/loops": {"prim", "replay/poses/tracking"},
+    "replay/poses/tracking": {"prim", "mapping", "replay/poses", "replay/poses/loops"},
     "replay/detection": {
         "prim", "mapping", "detect", "detect/networks", "detect/refinement", "detect/refinement/surroundings",
         "replay", "replay/poses", "replay/scans",

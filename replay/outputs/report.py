@@ -115,13 +115,14 @@ def _sensor_errors(detections: DetectionResult | None) -> dict[str, Any] | None:
 
 
 def _pose_uncertainty(result: ReplayResult) -> dict[str, Any]:
-    """Return the poses' standard deviations, their NEES, and the sensors they were fused from; None if not known."""
-    std = pose_std(result.poses)
+    """Return the poses' standard deviations, NEES, loops, and the sensors they were fused from; None if not known."""
+    std, loops = pose_std(result.poses), result.poses.loops
     return {
         "std_m": std and std[0],
         "std_rad": std and std[1],
         "nees": result.pose_nees,
         "matched": result.poses.matched,
+        "loops": loops and {"closed": loops.closed, "rejected": dict(loops.rejected)},
         "sensors": {
             sensor.name: {
                 "topic": sensor.topic,

@@ -132,6 +132,18 @@ class FusedSensor:
     scales: tuple[float, float] = (1.0, 1.0)
 
 
+class LoopCounts(NamedTuple):
+    """How many loops were closed in tracked poses.
+
+    Attributes:
+        closed: Loops.
+        rejected: Keyframes that were recognised and not relied upon, by the reason.
+    """
+
+    closed: int
+    rejected: Mapping[str, int]
+
+
 @dataclass(frozen=True)
 class LaserPoses:
     """The laser's pose at each of N scans.
@@ -152,6 +164,7 @@ class LaserPoses:
         mounts: The laser's poses (N, 3) on the robot, where poses were fused or there are several lasers.
         matched: Whether the poses are corrected by matching the scans with the map.
         mount_assumed: Whether the laser is only taken to be at the robot's origin: its mount is not in the log.
+        loops: The loops that were closed; None where none were searched for.
     """
 
     source: str
@@ -168,6 +181,7 @@ class LaserPoses:
     mounts: FloatArray | None = None
     matched: bool = False
     mount_assumed: bool = False
+    loops: LoopCounts | None = None
 
     @property
     def max_std(self) -> tuple[float, float] | None:

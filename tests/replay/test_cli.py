@@ -62,7 +62,7 @@ def test_a_replay_writes_a_recording_and_a_report_by_default(
         "messages_lost": 0,
         "recovered": False,
     }
-    unknown = dict.fromkeys(("rmse_m", "rmse_rad", "std_m", "std_rad", "nees", "sensors"))
+    unknown = dict.fromkeys(("rmse_m", "rmse_rad", "std_m", "std_rad", "nees", "loops", "sensors"))
     assert report["pose"] == {"source": "truth", "matched": False, **unknown}
     assert report["map"]["mapper"] == mapper
     assert report["map"]["origin_m"] == pytest.approx([-1.1, -1.1])

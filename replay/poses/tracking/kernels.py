@@ -80,6 +80,33 @@ class Window(NamedTuple):
     per_radian: float
 
 
+class Excluded(NamedTuple):
+    """What a search leaves out: poses near this one, given in the map's frame.
+
+    Attributes:
+        x: M.
+        y: M.
+        heading: Rad.
+        reach: M to each side; negative: nothing is left out.
+        turn: Rad to each side.
+    """
+
+    x: float = 0.0
+    y: float = 0.0
+    heading: float = 0.0
+    reach: float = -1.0
+    turn: float = 0.0
+
+
+@inline
+def _is_excluded(x: float, y: float, heading: float, excluded: Any) -> bool:
+    """Tell whether a search leaves a pose out."""
+    if not (x - excluded.x) ** 2 + (y - excluded.y) ** 2 < excluded.reach * abs(excluded.reach):
+        return False
+    turn = heading - excluded.heading
+    return bool(abs(turn - 2.0 * math.pi * math.floor((turn + math.pi) / (2.0 * math.pi))) < excluded.turn)
+
+
 @inline
 def _fit_line(ends: Any, i: int, rule: Any, out: Any) -> bool:
     """Fit a line to a beam's end point and its neighbours: the foot of the end point, and the normal; else False."""
@@ -384,7 +411,7 @@ def _score(scores: Any, level: int, cols_of: Any, rows_of: Any, right: int, up: 
 
 @kernel
 def search_pose(  # noqa: C901 - the branch and the bound belong together
-    points: Any, scores: Any, grid: Any, middle: Any, window: Any, least: float, out: Any
+    points: Any, scores: Any, grid: Any, middle: Any, window: Any, excluded: Any, least: float, out: Any
 ) -> float:
     """Find the best pose within a window by branch and bound.
 
@@ -394,6 +421,7 @@ def search_pose(  # noqa: C901 - the branch and the bound belong together
         grid: The :class:`Grid`.
         middle: (3,) the middle of the window.
         window: The :class:`Window`.
+        excluded: What is :class:`Excluded` from it.
         least: Only what scores more is found.
         out: (3,) gets the pose.
 
@@ -434,10 +462,11 @@ def search_pose(  # noqa: C901 - the branch and the bound belong together
             if level == 0:
                 cost = window.per_metre * math.hypot(right, up) * grid.cell
                 height = heights[size] - cost - window.per_radian * abs(q - turns) * window.step
-                if height > best:
+                x, y = middle[0] + right * grid.cell, middle[1] + up * grid.cell
+                heading = middle[2] + (q - turns) * window.step
+                if height > best and not _is_excluded(x, y, heading, excluded):
                     best, found = height, True
-                    out[0], out[1] = middle[0] + right * grid.cell, middle[1] + up * grid.cell
-                    out[2] = middle[2] + (q - turns) * window.step
+                    out[0], out[1], out[2] = x, y, heading
                 continue
             half, first = 1 << (level - 1), size
             for part in range(4):

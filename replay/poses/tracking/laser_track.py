@@ -9,7 +9,8 @@ import numpy as np
 
 from prim.arrays import FloatArray
 from prim.se2 import Trajectory, compose_poses, inverse_poses, path_length, relative_poses, wrap_angles
-from replay.poses.laser_poses import SCANS, LaserPoses, PosedScanSource, ScanTimes
+from replay.poses.laser_poses import SCANS, LaserPoses, LoopCounts, PosedScanSource, ScanTimes
+from replay.poses.loops.loop_closing import ClosedLoops
 from replay.poses.odometry_errors import OdometryErrors, find_odometry_errors
 from replay.poses.tracking.options import DEFAULTS, TrackingOptions
 from replay.poses.tracking.scan_tracker import ScanTrack, track
@@ -110,6 +111,8 @@ def _tracked(
     several = mounts if len(times.frame_ids) > 1 else poses.mounts
     valid = poses.valid & within[:count]
     placed = replace(poses, poses=whole, end_poses=ends, valid=valid, mounts=several)
+    if found.closed is not None:
+        placed = replace(placed, loops=LoopCounts(found.closed.closed, rejected_counts(found.closed)))
     if found.errors is not None:
         turn = _turned_by(lasers[0, 2])
         nearest = np.clip(np.searchsorted(times.stamps[at], times.stamps), 0, len(at) - 1)
@@ -163,4 +166,35 @@ def track_notes(found: ScanTrack, odometry: LaserPoses | None, times: ScanTimes)
             f"{len(found.broken)} {what} nowhere near those before, the first one number {found.broken[0]}: "
             "what lies before and after may not belong together"
         )
+    if found.closed is not None:
+        notes += loop_notes(found.closed)
     return tuple(notes)
+
+
+def loop_notes(closed: ClosedLoops) -> list[str]:
+    """Return what a user should know of loops.
+
+    Args:
+        closed: Those that were closed, and how many recognised places were rejected.
+
+    Returns:
+        A note; none where nothing was recognised.
+    """
+    rejected = rejected_counts(closed)
+    if not closed.closed and not rejected:
+        return []
+    what = {0: "no loop closed", 1: "1 loop closed"}.get(closed.closed, f"{closed.closed} loops closed")
+    reasons = ", ".join(f"{count} rejected as {reason}" for reason, count in rejected.items())
+    return [f"{what}, {reasons}" if reasons else what]
+
+
+def rejected_counts(closed: ClosedLoops) -> dict[str, int]:
+    """Return how many recognised keyframes were rejected, by the reason, in the order of the alphabet.
+
+    Args:
+        closed: The loops.
+
+    Returns:
+        The counts, none of them 0.
+    """
+    return dict(sorted((reason.value, count) for reason, count in closed.rejected.items()))

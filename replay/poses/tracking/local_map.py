@@ -9,6 +9,7 @@ import numpy as np
 
 from prim.arrays import FloatArray
 from replay.poses.tracking.kernels import (
+    Excluded,
     Fit,
     Grid,
     Window,
@@ -22,6 +23,9 @@ from replay.poses.tracking.kernels import (
 from replay.poses.tracking.options import LocalMapOptions
 
 NO_PRIOR = np.zeros((3, 3))
+
+NOTHING = Excluded()
+"""No pose is left out of a search."""
 
 
 class Match(NamedTuple):
@@ -121,11 +125,36 @@ class LocalMap:
         Returns:
             The pose (3,) of the best score; None where none is above the least.
         """
+        found = self.find(points, middle, window, levels, least)
+        return None if found is None else found[0]
+
+    def find(
+        self,
+        points: FloatArray,
+        middle: FloatArray,
+        window: Window,
+        levels: int,
+        least: float,
+        excluded: Excluded = NOTHING,
+    ) -> tuple[FloatArray, float] | None:
+        """Search for a scan in the map, but for some poses.
+
+        Args:
+            points: (N, 4) of the scan, thinned.
+            middle: (3,) the middle of the window.
+            window: What is searched.
+            levels: How many levels of coarser scores are used.
+            least: The least score.
+            excluded: The poses that are left out.
+
+        Returns:
+            The pose (3,) of the best score, and this; None where none is above the least.
+        """
         if not len(points):
             return None
         found = np.zeros(3)
-        score = search_pose(points, self._pyramid(levels), self._grid, middle, window, least, found)
-        return found if score > 0 else None
+        score = search_pose(points, self._pyramid(levels), self._grid, middle, window, excluded, least, found)
+        return (found, float(score)) if score > 0 else None
 
     def _pyramid(self, levels: int) -> FloatArray:
         """Return scores of cells (levels + 1, rows, cols): at each level maxima over squares of the one before."""

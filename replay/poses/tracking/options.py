@@ -105,14 +105,19 @@ class TrackingOptions:
         broken: A scan of a lower score after all that stands where it was predicted, and a new map begins.
         wide_window: How far a lost scan is searched for (m, rad).
         widest: The largest window in place (m).
-        settled_rounds: Rounds in which all scans are matched anew with those before and after them.
+        settled_rounds: Rounds in which all scans are matched anew with those before and after them …
+        closed_rounds: … and with those that are near once loops are closed.
         block: Keyframes that share a map in these.
+        near: Where loops were closed, keyframes within this distance (m) share it as well …
+        most_near: … the nearest so many.
         surfel: Points within so much (m) of each other become one in these maps.
-        settled_std: Standard deviation of the prior around a scan's pose in a round (m, rad).
+        settled_std: Standard deviation of the prior around a scan's pose in a round (m, rad) …
+        closed_std: … and where loops were closed: their graph says where scans are.
         least_std: Standard deviations of a match (m, rad) beside those that its residuals have: what a map of few
             scans has of its own; by halves of the beams of two buildings (bench/poses.py).
         first_std: Those of the first pose, which is known.
         coarse_cells: In a map with larger cells than this (m) the points of scans place these better than the map.
+        closed_noise: By scans alone loops are closed in cells of any size where the range noise is below this (m).
         windows: The fit of scans is tested in so many windows …
         window_scans: … of so many scans.
         misplaced: How far poses may be off in that test (m, rad).
@@ -153,12 +158,17 @@ class TrackingOptions:
     wide_window: tuple[float, float] = (1.0, math.radians(60))
     widest: float = 6.0
     settled_rounds: int = 2
+    closed_rounds: int = 1
     block: int = 5
+    near: float = 6.0
+    most_near: int = 60
     surfel: float = 0.05
     settled_std: tuple[float, float] = (0.02, math.radians(0.3))
+    closed_std: tuple[float, float] = (0.01, math.radians(0.15))
     least_std: tuple[float, float] = (0.0015, math.radians(0.06))
     first_std: float = 1e-5
     coarse_cells: float = 0.02
+    closed_noise: float = 0.03
     windows: int = 6
     window_scans: int = 12
     misplaced: tuple[float, float] = (0.1, 0.05)

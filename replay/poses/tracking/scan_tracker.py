@@ -1,8 +1,8 @@
 """Tracking: each scan is matched with a map of the last keyframes, from where odometry or constant velocity predict.
 
 A search about the prediction comes first, then a fit. Where odometry and constant velocity predict different places,
-both are tried, and the better score wins. What scores low is searched for further away. In the end every scan is
-matched again, with the keyframes before and after it.
+both are tried, and the better score wins. What scores low is searched for further away. Then every scan is matched
+again, with the keyframes before and after it, and, where loops were closed, with all that are near.
 """
 
 from __future__ import annotations
@@ -18,6 +18,9 @@ from prim import linear_algebra
 from prim.arrays import FloatArray, Stamps
 from prim.scan import PosedScan
 from prim.se2 import compose_poses, path_length, relative_poses, wrap_angles
+from replay.poses.loops.loop_closing import ClosedLoops, LoopCloser
+from replay.poses.loops.loop_errors import LoopErrors
+from replay.poses.loops.submaps import Keyframes
 from replay.poses.odometry_errors import NO_ERRORS, OdometryErrors
 from replay.poses.scan_registration import range_noise
 from replay.poses.tracking.kernels import Window
@@ -44,6 +47,7 @@ class ScanTrack:
             and scans fit well.
         odometry_errors: What is wrong with the odometry all the time.
         errors: What is unsure about the poses; None where scans were not matched anew in the end.
+        closed: The loops that were closed, and how many were rejected; None where none were searched for.
     """
 
     poses: FloatArray
@@ -57,6 +61,7 @@ class ScanTrack:
     overrules: bool = False
     odometry_errors: OdometryErrors = NO_ERRORS
     errors: TrackErrors | None = None
+    closed: ClosedLoops | None = None
 
 
 def track(
@@ -71,7 +76,7 @@ def track(
         scans: N scans of one laser, in the order of time.
         odometry: The laser's poses (N, 3) by odometry; None where there is none.
         settled_noise: All are matched anew in the end, with those before and after them, where their noise is less
-            than this (m).
+            than this (m); loops are closed then.
         options: Windows, maps, limits.
 
     Returns:
@@ -84,6 +89,7 @@ def track(
     tracker.run()
     if noise_std < settled_noise:
         tracker.settle()
+        tracker.close_loops()
     stands_still = odometry is not None and _stands_still(odometry, tracker.poses, options)
     is_wrong = stands_still or len(tracker.overruled) > options.overruled_share * len(scans)
     fits = not tracker.broken and float(np.median(tracker.scores)) > options.sure_score
@@ -98,6 +104,7 @@ def track(
         fits,
         is_wrong and fits,
         errors=tracker.errors() if noise_std < settled_noise else None,
+        closed=tracker.closed,
     )
 
 
@@ -135,6 +142,8 @@ class ScanTracker:
         keyframes: Scans that maps are made of.
         overruled: Scans at which odometry was not followed.
         broken: Scans that fit nowhere.
+        searched: Scans that were found by a wide search.
+        closed: The loops that were closed, and how many were rejected; None before they are searched for.
     """
 
     points: Sequence[FloatArray]
@@ -146,6 +155,8 @@ class ScanTracker:
     keyframes: list[int] = field(default_factory=lambda: [0])
     overruled: list[int] = field(default_factory=list)
     broken: list[int] = field(default_factory=list)
+    searched: list[int] = field(default_factory=list)
+    closed: ClosedLoops | None = None
     _map: LocalMap | None = None
     _first: int = 0
 
@@ -170,10 +181,10 @@ class ScanTracker:
                 self._map = None
 
     def settle(self) -> None:
-        """Match all scans anew with the keyframes before and after them, some times."""
+        """Match all scans anew, some times, with the keyframes before and after them and, by loops, near them."""
         starts = [0, *(self.keyframes.index(number) for number in self.broken)]
         pieces = list(zip(starts, [*starts[1:], len(self.keyframes)], strict=True))  # what is lost begins anew
-        for _ in range(self.options.settled_rounds):
+        for _ in range(self.options.settled_rounds if self._is_open else self.options.closed_rounds):
             settled = self.poses.copy()
             for start, stop in pieces:
                 for first in range(start, stop, self.options.block):
@@ -184,19 +195,70 @@ class ScanTracker:
         """Match the scans that follow some keyframes with a map of these and of those around them in their piece."""
         options, frames = self.options, self.keyframes
         after = min(first + options.block, piece.stop)
-        around = frames[max(first - options.keyframes, piece.start) : min(after + options.keyframes, piece.stop)]
+        around = [frames[number] for number in self._around(range(first, after), piece)]
         begin, end = frames[first], frames[after] if after < len(frames) else len(self.points)
         points = surfels(joined([moved(self._fine[one], self.poses[one]) for one in around]), options.surfel)
         if not len(points):
             return
         local = LocalMap(points, options.map)
-        place, turn = options.settled_std
+        place, turn = options.settled_std if self._is_open else options.closed_std
         prior = np.diag([place**-2, place**-2, turn**-2])
         for number in range(begin, end):
             if len(self.points[number]):
                 match = local.match(self.points[number], self.poses[number], None, prior)
                 settled[number], self.scores[number] = match.pose, match.score
                 self._matches[number] = match
+
+    def _around(self, block: range, piece: range) -> list[int]:
+        """Return the keyframes that some are matched with: those around them in time and, by loops, in place."""
+        options = self.options
+        before, after = block.start - options.keyframes, block.stop + options.keyframes
+        last = range(max(before, piece.start), min(after, piece.stop))
+        if self.closed is None or self._is_open:
+            return list(last)
+        poses = self.poses[self.keyframes]
+        away = np.hypot(*(poses[:, :2] - poses[block].mean(axis=0)[:2]).T)
+        away[self.closed.connected != self.closed.connected[block.start]] = np.inf
+        nearest = np.argsort(away, kind="stable")[: options.most_near]
+        return sorted({*last, *nearest[away[nearest] < options.near].tolist()})
+
+    @property
+    def _is_open(self) -> bool:
+        """Whether no loop was closed so far."""
+        return self.closed is None or not self.closed.loops
+
+    def close_loops(self) -> None:
+        """Find loops among the keyframes; where there are some, move all scans with these, and match them anew."""
+        self.closed = LoopCloser(self._keyframes()).run()
+        if self.closed.loops:
+            self._follow(self.closed.poses)
+            self.settle()
+
+    def _keyframes(self) -> Keyframes:
+        """Return what loops are searched in."""
+        frames = np.array(self.keyframes)
+        reached = np.searchsorted(frames, [*self.overruled, *self.searched])
+        unsure = np.zeros(len(frames), bool)
+        unsure[reached[reached < len(frames)]] = True
+        nothing = np.zeros((3, 3))
+        information = [self._matches[one].information if one in self._matches else nothing for one in self.keyframes]
+        odometry = None if self.odometry is None else self.odometry[frames]
+        points, poses = [self._fine[one] for one in self.keyframes], self.poses[frames]
+        return Keyframes(points, poses, np.array(information), odometry, np.isin(frames, self.broken), unsure)
+
+    def _follow(self, poses: FloatArray) -> None:
+        """Move all scans with the keyframes before and after them (K, 3)."""
+        frames = np.array(self.keyframes)
+        before = np.searchsorted(frames, np.arange(len(self.poses)), side="right") - 1
+        after = np.minimum(before + 1, len(frames) - 1)
+        after = np.where(np.isin(frames[after], self.broken), before, after)
+        share = (np.arange(len(self.poses)) - frames[before]) / np.maximum(frames[after] - frames[before], 1)
+        by_before, by_after = (
+            compose_poses(poses[by], relative_poses(self.poses[frames[by]], self.poses)) for by in (before, after)
+        )
+        change = by_after - by_before
+        change[:, 2] = wrap_angles(change[:, 2])
+        self.poses = by_before + share[:, None] * change
 
     def _covariance(self, match: Match) -> FloatArray:
         """Return the covariance (3, 3) of a match within its map: that of residuals, and what these do not show."""
@@ -213,6 +275,8 @@ class ScanTracker:
         options, covariances = self.options, np.zeros((len(self.points), 3, 3))
         for number, match in self._matches.items():
             covariances[number] = self._covariance(match)
+        if self.closed is not None and self.closed.loops:
+            return LoopErrors.by_graph(self.poses, covariances, self.keyframes, self.closed.graph, options.first_std)
         return TrackErrors.of(self.poses, covariances, self.keyframes, self.broken, options.widest, options.first_std)
 
     def _seen_from_first(self, poses: FloatArray) -> FloatArray:
@@ -244,12 +308,14 @@ class ScanTracker:
             wide = self._wide_match(number, predictions, local)
             if wide is not None and wide.score > best.score + options.min_gain:
                 best = wide
+                self.searched.append(number)
         if best.score < options.broken:
             self.broken.append(number)
             self._first = len(self.keyframes)
             self.poses[number], self.scores[number] = predictions[0].pose, best.score
             return
         self.poses[number], self.scores[number] = best.pose, best.score
+        self._matches[number] = best
         if self.odometry is not None and self._is_outside(best.pose, predictions[0]):
             self.overruled.append(number)
 

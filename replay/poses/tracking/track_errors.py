@@ -80,11 +80,14 @@ class TrackErrors:
         Returns:
             (M, 3, 3) of each later pose in the frame of the earlier one.
         """
-        spread = frame_covariances(
-            self.walk[last] - self.walk[first] + self.own[first] + self.own[last], self.poses[last]
-        )
+        apart = self._walked(first, last) + self.own[first] + self.own[last]
+        spread = frame_covariances(apart, self.poses[last])
         cos, sin = np.cos(self.poses[first, 2]), np.sin(self.poses[first, 2])
         turn = np.repeat(np.eye(3)[None], len(first), axis=0)
         turn[:, 0, 0], turn[:, 0, 1], turn[:, 1, 0], turn[:, 1, 1] = cos, sin, -sin, cos
         seen: FloatArray = turn @ spread @ turn.transpose(0, 2, 1)
         return seen
+
+    def _walked(self, first: NDArray[np.intp], last: NDArray[np.intp]) -> FloatArray:
+        """Return the covariances (M, 3, 3) of what keyframes have added between some poses and later ones."""
+        return self.walk[last] - self.walk[first]
