@@ -750,8 +750,8 @@ def pose_likelihood(
     """Compute the log-likelihood of a scan from a pose of the robot, its gradient, and rays' outer products.
 
     A ray's stopping probabilities are those of the direction next to its own. Derivatives are central differences.
-    The outer products are those of single rays' gradients (Berndt, Hall, Hall and Hausman 1974); the caller centres their
-    sum. A ray that misses the grid counts as an outlier.
+    The outer products are those of single rays' gradients (Berndt, Hall, Hall and Hausman 1974); the caller centres
+    their sum. A ray that misses the grid counts as an outlier.
 
     Args:
         rays: (N, 5) float64, in the frame of the laser: where each beam starts (x, y), its direction, its range (m).
