@@ -526,6 +526,7 @@ def test_given_pose_noise_is_used(replay: Run, driven_session: Path) -> None:
     assert sensors["gps"]["std_m"] == 0.2 and sensors["compass"]["std_rad"] == pytest.approx(math.radians(5))
     assert sensors["odom"] | {"std_rad": 0} == {
         "topic": "/odom", "used": 60, "rejected": 0, "std_m": 0.1, "std_rad": 0,
+        "distance_scale": 1, "turn_scale": 1,
     }  # fmt: skip
 
 

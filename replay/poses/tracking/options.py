@@ -68,7 +68,7 @@ class LocalMapOptions:
     kernel: float = 0.05
     widening: tuple[float, ...] = (3.0, 3.0, 1.7, 1.7)
     steps: int = 10
-    enough: float = 2e-5
+    enough: float = 1e-6
     min_cosine: float = 0.3
     point_weight: float = 0.15
     residual: float = 0.03
