@@ -54,8 +54,10 @@ def directional_stopping(stopping: NDArray[np.float32], options: IncidenceOption
     for k in range(options.directions):
         angle = math.pi * k / options.directions
         step = 1 / max(abs(math.cos(angle)), abs(math.sin(angle)))  # cells
-        trials = np.minimum(step * np.abs(np.cos(angle - normals)), 1)
-        maps[k] = -np.expm1((1 - coherence * (1 - trials)) * passing)
+        trials = 1 - coherence * (1 - np.minimum(step * np.abs(np.cos(angle - normals)), 1))
+        # nor does a ray that grazes a solid surface end in the first step that it takes there: its mean depth is that
+        # of one straight on, half a cell
+        maps[k] = np.minimum(-np.expm1(trials * passing), 2 * trials / (1 + trials))
     return maps
 
 

@@ -102,6 +102,31 @@ def test_selected_rays_are_spread_evenly_and_include_censored_ones(make_scan) ->
     assert first.tolist() == [1.0, -math.inf] and second.tolist() == [math.inf, 2.0]
 
 
+def test_nothing_pulls_scans_away_from_the_walls_nearby() -> None:
+    """Surfaces are thick in a map of noisy ranges, and walls nearby are seen at all angles."""
+    room = replace(ROOM, primitives=())
+    rng = np.random.default_rng(1)
+    lidar = Lidar(rays=400, noise_std=0.05)
+    poses = [Pose2D(x, y, rng.uniform(-3, 3)) for x in np.linspace(-0.7, 0.7, 8) for y in np.linspace(-0.7, 0.7, 8)]
+    scans = [lidar.measure(room, pose, k + 1, 0.1, rng) for k, pose in enumerate(poses)]
+    mapper = ForwardMapper(0.01, (-1.1, -1.1, 1.1, 1.1))
+    for scan, pose in zip(scans, poses, strict=True):
+        mapper.accumulate(scan, pose)
+    fit = mapper.fit()
+    pulls = []
+    for by_incidence in (False, True):
+        likelihood = ScanLikelihood.of(fit, fit.noise, by_incidence=by_incidence)
+        along = squares = 0.0
+        for scan, pose in zip(scans, poses, strict=True):
+            true = np.array([pose.x, pose.y, pose.theta])
+            beams = ScanRays.from_pieces([(scan, pose)], pose, 400)
+            found, _ = maximize_pose(likelihood, beams, NO_MOUNT, true, true, np.eye(3))
+            along += float((found - true)[:2] @ true[:2])
+            squares += float(true[:2] @ true[:2])
+        pulls.append(along / squares)
+    assert pulls[0] < -0.001 and abs(pulls[1]) < 0.5 * abs(pulls[0]), pulls
+
+
 @pytest.fixture(scope="module")
 def driven(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("driven") / "driven.mcap"
