@@ -193,6 +193,7 @@ class Pipeline:
             counting=tuple(branch.mapper for branch in branches if branch.counts_visits),
             detecting=tuple(branch.mapper for branch in branches if branch.detects),
             has_errors=evaluator.scores_maps and any(branch.detects for branch in branches),
+            loops=None if poses.loops is None else poses.poses[poses.loops.pairs, :2],
         )
         first = int(scans.stamps[0])
         with self._timer.stage("viewer"):

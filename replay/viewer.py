@@ -84,6 +84,7 @@ LASER_LENGTH, MAX_SCALE = 0.06, 10.0
 SCAN_COLOR = (255, 80, 60)
 TRAJECTORY_COLOR = (40, 110, 220)
 LASER_COLOR = (40, 110, 220)
+LOOP_COLOR = (20, 160, 90)
 TRUTH_COLOR, TRUTH_OTHERS_COLOR = (150, 150, 150), (200, 200, 200)
 LABEL_COLOR = (255, 255, 255)
 
@@ -155,6 +156,9 @@ class RerunViewer:
                 self._name_series(f"{layer}errors/lengths", LENGTH_ERRORS.values())
                 self._name_series(f"{layer}errors/angle", [ANGLE_ERROR])
             self._name_series(f"{layer}timing", [MAPPING_TIME])
+        if scene.loops is not None and len(scene.loops):
+            strips, radius = list(self._raised(scene.loops, TRAJECTORY_HEIGHT)), rr.Radius.ui_points(1.25)
+            self._log_static(f"{SCENE}/loops", rr.LineStrips3D(strips, colors=[LOOP_COLOR], radii=radius))
 
     def show_truth(self, position: int, stamp: int, world: World) -> None:
         """See :meth:`.Viewer.show_truth`."""

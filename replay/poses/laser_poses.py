@@ -132,16 +132,18 @@ class FusedSensor:
     scales: tuple[float, float] = (1.0, 1.0)
 
 
-class LoopCounts(NamedTuple):
-    """How many loops were closed in tracked poses.
+class PoseLoops(NamedTuple):
+    """The loops that were closed in tracked poses.
 
     Attributes:
         closed: Loops.
         rejected: Keyframes that were recognised and not relied upon, by the reason.
+        pairs: (L, 2) the scans that were recognised, each after the one in whose surroundings it was.
     """
 
     closed: int
     rejected: Mapping[str, int]
+    pairs: NDArray[np.intp]
 
 
 @dataclass(frozen=True)
@@ -181,7 +183,7 @@ class LaserPoses:
     mounts: FloatArray | None = None
     matched: bool = False
     mount_assumed: bool = False
-    loops: LoopCounts | None = None
+    loops: PoseLoops | None = None
 
     @property
     def max_std(self) -> tuple[float, float] | None:

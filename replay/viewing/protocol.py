@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Protocol
 
 from mapping.grid import OccupancyGrid
 from mapping.map_metrics import MapScores
+from prim.arrays import FloatArray
 from prim.errors import UsageError
 from prim.scan import PosedScan
 from prim.world import Bounds, World
@@ -71,6 +72,8 @@ class Scene:
         counting: The mappers that count the rays of each cell.
         detecting: The mappers in whose maps primitives are detected.
         has_errors: Whether detections are evaluated against ground truth.
+        loops: (L, 2, 2) for each loop where the laser was (m): when the place was seen first, and when it was
+            recognised.
     """
 
     log: str
@@ -81,6 +84,7 @@ class Scene:
     counting: tuple[str, ...] = ()
     detecting: tuple[str, ...] = ()
     has_errors: bool = False
+    loops: FloatArray | None = None
 
 
 class Viewer(Protocol):

@@ -5,6 +5,7 @@ import os
 import subprocess
 import sys
 from collections import defaultdict
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -39,11 +40,12 @@ def replayed(log: Path, path: Path, **options: Any) -> ReplayResult:
     return result
 
 
-def rows_of(path: Path) -> dict[str, list[dict[str, Any]]]:
-    """All rows of a recording by entity, static ones too."""
+def rows_of(path: Path, entity: str = "") -> dict[str, list[dict[str, Any]]]:
+    """All rows of a recording by entity, static ones too; or those of one entity."""
     rows = defaultdict(list)
     for chunk in rr.chunk.RrdReader(path).stream():
-        rows[str(chunk.entity_path)] += chunk.to_record_batch().to_pylist()
+        if entity in ("", chunk.entity_path):
+            rows[str(chunk.entity_path)] += chunk.to_record_batch().to_pylist()
     return rows
 
 
@@ -326,3 +328,13 @@ def test_recorded_logs_open_in_the_importer_of_rerun(noisy_session: Session, tmp
     for entity, component in drawn.items():
         assert sum(component in row for row in rows[entity]) == noisy_session.scans
     assert sum("Transform3D:translation" in row for row in rows["/tf_static"]) == 1
+
+
+def test_loops_are_drawn_where_they_were_closed(real_log: Callable[[str], Path], tmp_path: Path) -> None:
+    options = {"mapper": "det", "resolution": 0.05, "pose": "scans", "detect": False}
+    result = replayed(real_log("csail_raw.mcap"), path := tmp_path / "a.rrd", **options)
+    loops = result.poses.loops
+    assert loops is not None and loops.closed > 3 and len(loops.pairs) >= loops.closed
+    strips = np.array(value(rows_of(path, "/map/loops")["/map/loops"][0], "strips"))[..., :2]
+    assert strips == pytest.approx(result.poses.poses[loops.pairs, :2], abs=1e-4)
+    assert np.linalg.norm(strips[:, 1] - strips[:, 0], axis=1).max() < 6

@@ -9,7 +9,7 @@ import numpy as np
 
 from prim.arrays import FloatArray
 from prim.se2 import Trajectory, compose_poses, inverse_poses, path_length, relative_poses, wrap_angles
-from replay.poses.laser_poses import SCANS, LaserPoses, LoopCounts, PosedScanSource, ScanTimes
+from replay.poses.laser_poses import SCANS, LaserPoses, PosedScanSource, PoseLoops, ScanTimes
 from replay.poses.loops.loop_closing import ClosedLoops
 from replay.poses.odometry_errors import OdometryErrors, find_odometry_errors
 from replay.poses.tracking.options import DEFAULTS, TrackingOptions
@@ -112,7 +112,10 @@ def _tracked(
     valid = poses.valid & within[:count]
     placed = replace(poses, poses=whole, end_poses=ends, valid=valid, mounts=several)
     if found.closed is not None:
-        placed = replace(placed, loops=LoopCounts(found.closed.closed, rejected_counts(found.closed)))
+        frames = at[list(found.keyframes)]
+        recognised = [(frames[loop.first], frames[loop.last]) for loop in found.closed.loops]
+        pairs = np.array(recognised, np.intp).reshape(-1, 2)
+        placed = replace(placed, loops=PoseLoops(found.closed.closed, rejected_counts(found.closed), pairs))
     if found.errors is not None:
         turn = _turned_by(lasers[0, 2])
         nearest = np.clip(np.searchsorted(times.stamps[at], times.stamps), 0, len(at) - 1)
