@@ -119,7 +119,7 @@ def _fusion_inputs(
             f"--fuse {','.join(names)}: {unknown[0] or 'an empty name'} is no sensor; they are {', '.join(SENSORS)}"
         )
     if compass_topic is not None and imu_topic is not None:
-        raise UsageError("headings come from one sensor: --compass-topic or --imu-topic")
+        raise UsageError("--compass-topic excludes --imu-topic: headings come from one sensor")
     noise = SensorNoise(*(pose_noise or (None, None)), *(odom_noise or (None, None)))
     return FusionInputs(tuple(name for name in SENSORS if name in names), gps_topic, compass_topic, imu_topic, noise)
 

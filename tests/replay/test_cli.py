@@ -546,7 +546,8 @@ def test_matched_scans_correct_odometry(replay: Run, driven_session: Path, optio
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        (["--fuse", "sonar"], "sonar is no sensor; they are odom, gps, compass"),
+        (["--fuse", "sonar"], "sonar is no sensor; they are odom, gps, compass, imu"),
+        (["--compass-topic", "/a", "--imu-topic", "/b"], "--compass-topic excludes --imu-topic"),
         (["--fuse", "odom,"], "an empty name is no sensor"),
         (["--pose", "odom", "--fuse", "gps"], "do not go with --pose odom"),
         (["--pose", "tf", "--gps-topic", "/gps"], "do not go with --pose tf"),
