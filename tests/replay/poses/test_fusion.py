@@ -382,12 +382,19 @@ def test_wandering_fixes_are_found_and_reckoned_with(seed: int) -> None:
     assert Fusion(driven.nodes()).noise.position_wander is None
 
 
-def test_wandering_fixes_are_known_from_a_bad_odometry_by_what_a_receiver_states() -> None:
-    driven = drive(12, 1200)
-    other = replace(driven, fixes=driven.fixes + wandering(np.random.default_rng(12), 1200, 1.5, 60.0))
-    noise = Fusion(other.nodes(compass=False, fix_stds=np.full(1200, 1.5))).noise
-    assert noise.position_wander is not None and noise.position_wander.std > 0.4
+@pytest.mark.parametrize("seed", [17, 22])
+def test_wandering_fixes_are_known_from_a_bad_odometry_by_what_a_receiver_states(seed: int) -> None:
+    """A fix a second for a minute: by themselves they could be right, and the odometry ten times as bad as it is."""
+    driven, rng = drive(seed), np.random.default_rng(seed)
+    fixes = driven.truth[:, :2] + rng.normal(0, 0.05, (600, 2))
+    fixes += wandering(np.random.default_rng(seed + 50), 600, 1.5, 60.0)
+    readings = driven.stamps[::10], fixes[::10]
+    stated = FusionNodes.from_readings(driven.stamps, driven.odometry, readings, None, fix_stds=np.full(60, 1.5))
+    noise = Fusion(stated).noise
+    assert noise.position_wander is not None and 0.5 < noise.position_wander.std < 3
     assert noise.odometry_translation_std == pytest.approx(0.05, rel=0.5)
+    unknown = Fusion(replace(stated, stated_fix_std=None)).noise
+    assert unknown.position_wander is None and unknown.odometry_translation_std > 0.2
 
 
 def test_fixes_count_by_what_is_stated_of_each() -> None:

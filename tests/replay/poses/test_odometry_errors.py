@@ -63,6 +63,14 @@ def test_delay_is_found_and_does_not_pass_for_a_scale(delay: float) -> None:
     )
 
 
+def test_scales_are_those_of_the_motion_at_the_time_that_odometry_shows_it() -> None:
+    stamps, truth = drive(7)
+    late, _ = Trajectory(stamps, truth).at(stamps - 4 * SECOND // 10)
+    found = find_odometry_errors(stamps, measured(late, np.random.default_rng(7), 1.06, 0.9), truth)
+    assert found.turn_scale == pytest.approx(1 / 0.9, abs=0.012)
+    assert found.distance_scale == pytest.approx(1 / 1.06, abs=0.02)
+
+
 def test_correction_takes_the_scales_out() -> None:
     _, truth = drive(8, 200)
     scaled = integrate_steps(relative_steps(truth) * [1.1, 1.1, 0.9], truth[0])
