@@ -55,6 +55,27 @@ def test_rays_end_at_one_depth_whatever_their_angle(normal: float) -> None:
     assert mean_depth(plain, normal + angle, normal) < straight - 0.5
 
 
+def test_rays_that_graze_a_solid_surface_end_in_the_middle_of_a_cell_too() -> None:
+    solid = np.zeros((SIZE, SIZE), np.float32)
+    solid[:, SIZE // 2] = 0.99
+    number, directions = 8, 24
+    angle = math.pi * number / directions  # 60 degrees off the normal, which is along x
+    steps = np.arange(-60, 61) / math.tan(angle)  # of x, one a row
+    by_direction = directional_stopping(solid, IncidenceOptions(directions=directions))[number]
+
+    def mean_depth(stopping: NDArray[np.float32]) -> float:
+        depths = []
+        for start in np.linspace(0, 1, 40, endpoint=False):
+            x = steps + start / math.tan(angle) + SIZE // 2
+            ends = stopping[np.arange(121), np.clip(x.astype(int), 0, SIZE - 1)].astype(float)
+            reached = np.concatenate(([1.0], np.cumprod(1 - ends)[:-1]))
+            depths.append((reached * ends * (x - SIZE // 2)).sum() / (reached * ends).sum())
+        return float(np.mean(depths))
+
+    assert mean_depth(by_direction) == pytest.approx(0.5, abs=0.06)
+    assert mean_depth(solid) < 0.35
+
+
 def test_what_has_no_normal_is_as_it_was() -> None:
     stopping = np.zeros((40, 40), np.float32)
     stopping[20, 20] = 0.7
