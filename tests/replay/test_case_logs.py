@@ -80,11 +80,11 @@ def test_messages_of_ros1_in_mcap_are_read() -> None:
 
 def test_scans_of_two_scanners_are_matched_as_those_of_one_robot() -> None:
     result = replayed("two_lidars", match_scans=True)
-    kinds = sorted(str(primitive.kind) for primitive in result.primitives)
-    assert kinds in (["circle", "square"], ["circle", "rectangle"])  # matched poses are off by millimetres
-    for primitive in result.primitives:
+    kinds = [str(primitive.kind) for primitive in result.primitives]
+    boxes, rounds = ("square", "rectangle"), ("circle", "ellipse")  # matched poses are off by millimetres
+    assert sorted(kind in boxes for kind in kinds) == [False, True] and {*kinds} <= {*boxes, *rounds}
+    for primitive, kind in zip(result.primitives, kinds, strict=True):
         sizes = [*primitive.size.values()]
-        assert sizes == pytest.approx(
-            [0.15 if len(sizes) == 1 and primitive.theta is None else 0.25] * len(sizes), abs=0.01
-        )
+        expected = 0.25 if kind in boxes else 0.15
+        assert sizes == pytest.approx([expected] * len(sizes), abs=0.015)
     assert result.grid.frame.rows < 320
