@@ -132,7 +132,7 @@ def initial_state(nodes: FusionNodes, noise: FloatArray, options: FusionOptions)
     Args:
         nodes: The measurements.
         noise: The noise parameters (11,).
-        options: How sure it is.
+        options: Its standard deviations.
 
     Returns:
         The pose and its covariance, from the first readings.

@@ -91,23 +91,18 @@ class FusionNodes:
         nodes = nodes[(nodes >= first) & (nodes <= last)]
         if not len(nodes):
             raise ValueError("nothing lies within the time of the sensors")
-        initial_pose = np.zeros(3)
-        if odometry is None:
-            steps, scales = np.zeros((len(nodes), 3)), np.diff(nodes, prepend=nodes[0]) / 1e9
-        else:
-            poses, _ = odometry.at(nodes)
-            initial_pose, steps = poses[0], relative_steps(poses)
-            lengths = weighted_path_lengths(odometry, options.rotation_distance)
-            scales = np.diff(np.interp(nodes, odometry.stamps, lengths), prepend=0.0)
-            scales[0] = 0.0
-            scales += options.idle_distance * np.diff(nodes, prepend=nodes[0]) / 1e9
+        seconds = np.diff(nodes, prepend=nodes[0]) / 1e9
+        initial_pose, steps, scales = np.zeros(3), np.zeros((len(nodes), 3)), seconds
+        if odometry is not None:
+            initial_pose, steps, lengths = _steps_of(odometry, nodes, options)
+            scales = lengths + options.idle_distance * seconds
         stated, factors = _relative_stds(fix_stds, options.max_fix_scale)
         given = (fixes[0], factors) if fixes is not None and factors is not None else None
         return cls(
             nodes,
             steps,
             scales,
-            np.diff(nodes, prepend=nodes[0]) / 1e9,
+            seconds,
             _at_nodes(nodes, fixes, 2),
             np.nan_to_num(_at_nodes(nodes, given, 1)[:, 0], nan=1.0),
             stated,
@@ -164,6 +159,15 @@ class FusionNodes:
             fix_scales=self.fix_scales[indices],
             headings=self.headings[indices],
         )
+
+
+def _steps_of(
+    odometry: Trajectory, nodes: Stamps, options: FusionOptions
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return an odometry's first pose (3,), and the step (N, 3) to each node with its weighted length (N,)."""
+    poses, _ = odometry.at(nodes)
+    lengths = np.interp(nodes, odometry.stamps, weighted_path_lengths(odometry, options.rotation_distance))
+    return poses[0], relative_steps(poses), np.diff(lengths, prepend=lengths[0])
 
 
 def _at_nodes(nodes: Stamps, readings: TimedValues | None, columns: int) -> FloatArray:

@@ -335,7 +335,7 @@ def test_no_loop_closes_in_a_corridor_that_is_driven_once(spacing: float | None)
 
 
 def test_no_loop_closes_where_corridors_look_alike() -> None:
-    """Up one corridor and down another that cannot be told from it, 5 m beside it."""
+    """Up one corridor and down another that looks the same, 5 m beside it."""
     up = np.column_stack((np.linspace(-18, 18, 181), np.zeros(181), np.zeros(181)))
     down = up[::-1] + np.array([0.0, 5.0, math.pi])
     across = np.column_stack((np.full(24, 18.0), np.linspace(0.2, 4.8, 24), np.full(24, math.pi / 2)))
